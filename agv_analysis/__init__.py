@@ -1,0 +1,1 @@
+"""Offline: recordings, simulation, convergence, stability, command line."""

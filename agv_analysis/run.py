@@ -1,0 +1,52 @@
+"""One run of the loop as arrays: the same type from a recorded bag and from the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.scenario import Scenario
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of N steps, row i of every array belonging to step k[i]; SI units, frame `map` unless said otherwise."""
+
+    scenario: Scenario
+    k: NDArray[np.int64]
+    """Steps, shape (N,), increasing; without gaps unless messages are missing."""
+    pose: Floats
+    """X_c(k) = x, y, theta of the AGV, shape (N, 3); theta counts turns."""
+    reference: Floats
+    """X_r(k) and its speeds: x, y, theta, v_r, w_r, shape (N, 5); theta counts turns."""
+    error: Floats
+    """eps(k) as the edge computed it: x_e, y_e, theta_e in the AGV's frame, shape (N, 3); NaN where none was sent."""
+    command: Floats
+    """u(k) = v, w as the controller sent it, shape (N, 2); NaN where none was sent."""
+    n_ul: NDArray[np.int64]
+    """Steps since the freshest pose that the edge holds, shape (N,)."""
+    lost: NDArray[np.bool_]
+    """Verdict of the uplink on slot k, shape (N,)."""
+    downlink_lost: NDArray[np.bool_]
+    """Verdict of the downlink on slot k, shape (N,)."""
+    source: str = "simulation"
+    """Where the run comes from: the path of its bag, or `simulation`."""
+    notes: tuple[str, ...] = field(default=())
+    """What a reader must know of the recording: missing messages, an interrupted run."""
+
+    @property
+    def ts(self) -> float:
+        """Sampling period T_s [s]."""
+        return self.scenario.plant.ts
+
+    @property
+    def time(self) -> Floats:
+        """Time since step 0 [s], shape (N,)."""
+        return self.k * self.ts
+
+    def __len__(self) -> int:
+        return len(self.k)

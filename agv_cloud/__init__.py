@@ -1,0 +1,1 @@
+"""The edge cloud: reference track, tracking error, control law."""

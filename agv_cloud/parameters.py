@@ -1,0 +1,50 @@
+"""Parameters of the edge's side: error detector and controller."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from agv_cloud.tracks import TRACKS
+from agv_ros.parameters import LoopParameters, ParameterError, parameter
+
+POLICIES = ("hold",)
+
+
+@dataclass(frozen=True)
+class ErrorDetectorParameters(LoopParameters):
+    """Parameters of the node `error_detector`."""
+
+    track: str = parameter("paper", "reference track", choices=(*TRACKS, "csv"))
+    track_file: str = parameter("", "track csv: file with the columns t [s], v [m/s], w [rad/s]")
+    track_start: tuple[float, float, float] = parameter(
+        (0.0, 0.0, 1.5707963267948966), "X_r(0) = [x, y, theta] in frame map", unit="m, m, rad"
+    )
+    lap_time: float = parameter(100.0, "time T of one lap of the track", unit="s", above=0.0, high=1e6)
+    speed: float = parameter(
+        1.0, "speed of the tracks line, circle, eight and warehouse", unit="m/s", above=0.0, high=100.0
+    )
+    policy: str = parameter("hold", "what the edge does with an outdated pose", choices=POLICIES)
+
+    def __post_init__(self) -> None:
+        """Check what no single bound can say."""
+        if self.track == "csv" and not self.track_file:
+            raise ParameterError("error_detector.track is csv, but error_detector.track_file is empty: name a file")
+        if self.lap_time < 16.0 * self.ts:
+            raise ParameterError(
+                f"error_detector.lap_time must be at least 16 ts = {16.0 * self.ts:g} s, got {self.lap_time!r}"
+            )
+
+
+@dataclass(frozen=True)
+class ControllerParameters(LoopParameters):
+    """Parameters of the node `controller`."""
+
+    kx: float = parameter(25.0, "gain K_x of the error along the track", unit="1/s", low=0.0, high=1e6, runtime=True)
+    ky: float = parameter(1.0, "gain K_y of the error across the track", unit="1/m^2", low=0.0, high=1e6, runtime=True)
+    ktheta: float = parameter(
+        2.0, "gain K_theta of the error of heading", unit="1/m", low=0.0, high=1e6, runtime=True
+    )
+    v_max: float = parameter(
+        math.inf, "limit on |v|, .inf: none", unit="m/s", above=0.0, high=math.inf, runtime=True
+    )

@@ -1,0 +1,1 @@
+"""The shop floor and the air: the AGV and the radio channel."""

@@ -1,0 +1,13 @@
+"""The deterministic outage of the theory."""
+
+from __future__ import annotations
+
+
+def burst(k: int, n: int, start_step: int) -> bool:
+    """Exactly `n` consecutive losses: after each received message (start_step < 0), or once from step `start_step`.
+
+    Loss rate n / (n + 1) in the periodic case, which is the switched system M_L with L = n + 1.
+    """
+    if start_step < 0:
+        return k % (n + 1) != 0
+    return start_step <= k < start_step + n

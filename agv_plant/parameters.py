@@ -1,0 +1,69 @@
+"""Parameters of the AGV's side: plant and relay."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from agv_plant.channels import MODELS
+from agv_plant.unicycle import STEPS
+from agv_ros.parameters import LoopParameters, group, parameter
+
+
+@dataclass(frozen=True)
+class PlantParameters(LoopParameters):
+    """Parameters of the node `plant`."""
+
+    initial_pose: tuple[float, float, float] = parameter(
+        (0.0, 5.0, 1.5707963267948966), "X_c(0) = [x, y, theta] in frame map", unit="m, m, rad"
+    )
+    integration: str = parameter("euler", "how the plant integrates one period", choices=tuple(STEPS))
+    clock: str = parameter(
+        "lockstep",
+        "lockstep: step k+1 follows the answer to step k, as fast as it comes; realtime: one step every ts",
+        choices=("lockstep", "realtime"),
+    )
+    duration: float = parameter(
+        100.0, "length of the run, .inf: until stopped; it cuts the track short, it does not rescale it", unit="s",
+        above=0.0, high=math.inf,
+    )  # fmt: skip
+    answer_timeout: float = parameter(
+        5.0, "lockstep: how long to wait for the answer to a step before giving up", unit="s", above=0.0, high=3600.0
+    )
+    cmd_vel_timeout: float = parameter(
+        0.5, "realtime: the AGV stops when its newest command is older than this", unit="s", above=0.0, high=3600.0
+    )
+
+
+@dataclass(frozen=True)
+class ChannelParameters:
+    """One direction of the radio channel."""
+
+    model: str = parameter("perfect", "channel model", choices=tuple(MODELS))
+    p: float = parameter(
+        0.0, "bernoulli: loss probability; gilbert_elliott: probability of good to bad, per slot", low=0.0, high=1.0,
+        runtime=True,
+    )  # fmt: skip
+    r: float = parameter(
+        1.0, "gilbert_elliott: probability of bad to good, per slot", low=0.0, high=1.0, runtime=True
+    )
+    h: float = parameter(
+        0.0, "gilbert_elliott: probability of delivery in the bad state", low=0.0, high=1.0, runtime=True
+    )
+    k: float = parameter(
+        1.0, "gilbert_elliott: probability of delivery in the good state", low=0.0, high=1.0, runtime=True
+    )
+    n: int = parameter(0, "burst: number of consecutive slots lost", low=0, high=1_000_000, runtime=True)
+    start_step: int = parameter(
+        -1, "burst: the one step from which n slots are lost; -1: n are lost after each received one", low=-1,
+        high=2**62, runtime=True,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RelayParameters(LoopParameters):
+    """Parameters of the node `relay`."""
+
+    uplink: ChannelParameters = group(ChannelParameters)
+    downlink: ChannelParameters = group(ChannelParameters)
+    seed: int = parameter(1, "seed of all random outcomes of the channel", low=0, high=2**62)

@@ -1,0 +1,56 @@
+"""One direction of the radio link: the verdict on slot k, and what the other end holds after it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_plant.channels import GOOD, MODELS
+from agv_plant.parameters import ChannelParameters
+from agv_plant.random_stream import uniforms
+
+_BLOCK = 4096
+
+
+class Channel:
+    """Verdicts of one channel, a pure function of (parameters, seed, stream name, k).
+
+    The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot 0,
+    so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
+    """
+
+    def __init__(self, parameters: ChannelParameters, seed: int, stream: str) -> None:
+        self.parameters = parameters
+        self._seed = seed
+        self._stream = stream
+        self._next = 0
+        self._state = GOOD
+        self._last = False
+        self._first_of_block = -1
+        self._block: Sequence[Sequence[float]] = ()
+
+    def lost(self, k: int) -> bool:
+        """Is the message of slot `k` lost? Slot 0 never is: a run begins with the AGV known to the edge."""
+        if k < self._next - 1:
+            self._next, self._state = 0, GOOD
+        model = MODELS[self.parameters.model]
+        while self._next <= k:
+            lost, self._state = model(self.parameters, self._next, self._uniforms(self._next), self._state)
+            self._last = lost and self._next > 0
+            self._next += 1
+        return self._last
+
+    def _uniforms(self, k: int) -> Sequence[float]:
+        first = k - k % _BLOCK
+        if first != self._first_of_block:
+            self._block = uniforms(self._seed, self._stream, first, _BLOCK).tolist()
+            self._first_of_block = first
+        return self._block[k - first]
+
+
+def losses(parameters: ChannelParameters, seed: int, stream: str, steps: int) -> NDArray[np.bool_]:
+    """Verdicts of the slots 0 .. steps - 1, True where lost, shape (steps,)."""
+    channel = Channel(parameters, seed, stream)
+    return np.fromiter((channel.lost(k) for k in range(steps)), dtype=np.bool_, count=steps)

@@ -1,0 +1,42 @@
+"""The plant: a unicycle that holds its command for one sampling period.
+
+    dx/dt = v cos(theta),  dy/dt = v sin(theta),  dtheta/dt = w
+
+Scalar functions of floats, SI units, frame `map`. The angle is never wrapped: it counts turns.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+
+class State(NamedTuple):
+    """Posture X = (x, y, theta) [m, m, rad] in frame `map`."""
+
+    x: float
+    y: float
+    theta: float
+
+
+def euler_step(x: float, y: float, theta: float, v: float, w: float, ts: float) -> tuple[float, float, float]:
+    """X(k+1) = X(k) + T_s [v cos theta, v sin theta, w] (the paper's eq. 20).
+
+    The reference track is made by this same function, so that a perfect start stays perfect to the last bit.
+    """
+    return x + ts * (v * math.cos(theta)), y + ts * (v * math.sin(theta)), theta + ts * w
+
+
+def arc_step(x: float, y: float, theta: float, v: float, w: float, ts: float) -> tuple[float, float, float]:
+    """X(k+1) on the exact circular arc of a constant (v, w).
+
+    The chord has length v T_s sinc(w T_s / 2) and direction theta + w T_s / 2, which has no singularity at w = 0.
+    """
+    half = 0.5 * w * ts
+    # Below 1e-4 the series of sin(h)/h is exact in double precision with two terms.
+    sinc = math.sin(half) / half if abs(half) > 1e-4 else 1.0 - half * half / 6.0
+    chord = v * ts * sinc
+    return x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + w * ts
+
+
+STEPS = {"euler": euler_step, "arc": arc_step}

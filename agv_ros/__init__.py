@@ -1,0 +1,1 @@
+"""ROS plumbing that the AGV's side and the edge's side share."""

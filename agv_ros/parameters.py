@@ -1,0 +1,204 @@
+"""Typed parameters: one field says name, default, unit, meaning and bounds, for ROS and for everything without it.
+
+A node's parameters are a frozen dataclass whose fields are made by `parameter` (or by `group`, a nested dataclass whose
+names get a prefix, as in `uplink.p`). Nodes declare it to ROS, the runner and the analysis read it from a params file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+class ParameterError(ValueError):
+    """A parameter that was refused; the text names it, what was found, what is allowed."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What is known of one parameter, apart from its value."""
+
+    name: str
+    kind: str  # "double", "integer", "string", "bool" or "double_array", as ROS names them
+    default: Any
+    unit: str
+    description: str
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    length: int | None = None
+    runtime: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """What values are allowed, in words: `in [0, 1]`, `one of hold, align`."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        if self.kind not in ("double", "integer"):
+            return f"{self.length} finite numbers" if self.length else f"a {self.kind}"
+        if self.above is not None and self.high is None:
+            return f"> {self.above:g} and finite"
+        left = f"({self.above:g}" if self.above is not None else "(-inf" if self.low is None else f"[{self.low:g}"
+        if self.high is None:
+            return f"in {left}, inf)"
+        return f"in {left}, {self.high:g}]"
+
+    def check(self, owner: str, value: object) -> Any:
+        """`value`, as the field's type, if it is allowed. Raises ParameterError naming `owner.name` otherwise."""
+        where = f"{owner}.{self.name}" if owner else self.name
+        if self.kind == "double":
+            if isinstance(value, int) and not isinstance(value, bool):
+                raise ParameterError(f"{where} is a double, got the integer {value}: write {value}.0")
+            if not isinstance(value, float):
+                raise ParameterError(f"{where} is a double, got {value!r}")
+            self._check_number(where, value)
+        elif self.kind == "integer":
+            if not isinstance(value, int) or isinstance(value, bool):
+                raise ParameterError(f"{where} is an integer, got {value!r}")
+            self._check_number(where, value)
+        elif self.kind == "bool":
+            if not isinstance(value, bool):
+                raise ParameterError(f"{where} is true or false, got {value!r}")
+        elif self.kind == "string":
+            if not isinstance(value, str):
+                raise ParameterError(f"{where} is a string, got {value!r}")
+            if self.choices and value not in self.choices:
+                raise ParameterError(f"{where} must be {self.allowed}, got {value!r}")
+        else:
+            return self._check_array(where, value)
+        return value
+
+    def _check_number(self, where: str, value: float) -> None:
+        fits = (
+            (self.low is None or value >= self.low)
+            and (self.above is None or value > self.above)
+            and (value <= self.high if self.high is not None else value < math.inf)
+        )
+        if math.isnan(value) or not fits or value == -math.inf:
+            raise ParameterError(f"{where} must be {self.allowed}, got {value!r}")
+
+    def _check_array(self, where: str, value: object) -> tuple[float, ...]:
+        if not hasattr(value, "__iter__") or isinstance(value, str):
+            raise ParameterError(f"{where} is a list of {self.length} doubles, got {value!r}")
+        numbers = list(value)
+        for number in numbers:
+            if isinstance(number, int) and not isinstance(number, bool):
+                raise ParameterError(f"{where} is a list of doubles, got the integer {number}: write {number}.0")
+            if not isinstance(number, float) or not math.isfinite(number):
+                raise ParameterError(f"{where} must be {self.allowed}, got {numbers!r}")
+        if len(numbers) != self.length:
+            raise ParameterError(f"{where} must be {self.allowed}, got {len(numbers)}: {numbers!r}")
+        return tuple(numbers)
+
+
+def parameter(
+    default: T,
+    description: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] = (),
+    runtime: bool = False,
+) -> T:
+    """Dataclass field for one parameter.
+
+    `low` and `high` are included, `above` is not; a double is finite unless `high` is inf. A `runtime` parameter can be
+    changed while the node runs. A tuple default makes a double_array of that length.
+    """
+    meta = {"description": description, "unit": unit, "low": low, "high": high, "above": above}
+    meta.update(choices=choices, runtime=runtime)
+    return typing.cast(T, dataclasses.field(default=default, metadata={"parameter": meta}))
+
+
+def group(schema: type[T]) -> T:
+    """Dataclass field for a nested dataclass of parameters; its names get this field's name and a dot before them."""
+    return typing.cast(T, dataclasses.field(default_factory=schema, metadata={"group": schema}))
+
+
+_KINDS = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double_array"}
+
+
+def parameters_of(schema: type) -> dict[str, Parameter]:
+    """The parameters of a schema by their full (dotted) names, in the order of declaration."""
+    found: dict[str, Parameter] = {}
+    for field in dataclasses.fields(schema):
+        if "group" in field.metadata:
+            for name, inner in parameters_of(field.metadata["group"]).items():
+                found[f"{field.name}.{name}"] = dataclasses.replace(inner, name=f"{field.name}.{name}")
+            continue
+        length = len(field.default) if isinstance(field.default, tuple) else None
+        found[field.name] = Parameter(
+            name=field.name,
+            kind=_KINDS[type(field.default)],
+            default=field.default,
+            length=length,
+            **field.metadata["parameter"],
+        )
+    return found
+
+
+def build(schema: type[T], values: Mapping[str, object], owner: str = "") -> T:
+    """Instance of `schema` from values by dotted name; what is absent keeps its default.
+
+    Raises ParameterError for an unknown name, a wrong type, a value out of bounds, or values that do not go together.
+    """
+    known = parameters_of(schema)
+    for name in values:
+        if name not in known:
+            raise ParameterError(f"unknown parameter {owner}.{name}: {owner} has {', '.join(known)}")
+    checked = {name: known[name].check(owner, value) for name, value in values.items()}
+    return _assemble(schema, checked)
+
+
+def _assemble(schema: type[T], values: Mapping[str, Any]) -> T:
+    arguments: dict[str, Any] = {}
+    for field in dataclasses.fields(schema):  # type: ignore[arg-type]
+        if "group" in field.metadata:
+            prefix = field.name + "."
+            inner = {name[len(prefix) :]: value for name, value in values.items() if name.startswith(prefix)}
+            arguments[field.name] = _assemble(field.metadata["group"], inner)
+        elif field.name in values:
+            arguments[field.name] = values[field.name]
+    return schema(**arguments)
+
+
+def as_dict(instance: object) -> dict[str, Any]:
+    """All values of a schema's instance by dotted name."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(instance):  # type: ignore[arg-type]
+        value = getattr(instance, field.name)
+        if "group" in field.metadata:
+            found.update({f"{field.name}.{name}": inner for name, inner in as_dict(value).items()})
+        else:
+            found[field.name] = value
+    return found
+
+
+@dataclass(frozen=True)
+class LoopParameters:
+    """What every node of a loop must agree on, and how its nodes find each other."""
+
+    ts: float = parameter(0.005, "sampling period T_s, the same on all nodes", unit="s", low=1e-6, high=10.0)
+    start_time: float = parameter(
+        1.0, "instant t_0 of step 0, the same on all nodes; never 0, which means 'no time' in ROS", unit="s",
+        low=1e-3, high=2147483647.0,
+    )  # fmt: skip
+    wait_for_subscribers: int = parameter(
+        0,
+        "a node listens to its inputs only once each of its outputs has this many subscribers; "
+        "1 makes the start of a loop lossless, 2 that of a recorded one",
+        low=0,
+        high=100,
+    )
+
+
+SHARED = ("ts", "start_time", "wait_for_subscribers")

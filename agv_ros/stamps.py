@@ -1,0 +1,49 @@
+"""The grid of sampling instants: stamp of step k and back.
+
+A step's number always comes from a message's stamp, never from counting callbacks: a lost, repeated or reordered
+message then cannot shift the loop's time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+NS_PER_S = 1_000_000_000
+
+
+class OffGridError(ValueError):
+    """A stamp that is no sampling instant t_k with k >= 0."""
+
+
+def to_nanoseconds(seconds: float) -> int:
+    """Nearest whole nanosecond of a duration or instant [s]."""
+    return round(seconds * NS_PER_S)
+
+
+class Grid(NamedTuple):
+    """Sampling instants t_k = start_ns + k ts_ns."""
+
+    start_ns: int
+    ts_ns: int
+
+    @classmethod
+    def of(cls, start_time: float, ts: float) -> Grid:
+        """Grid that starts at `start_time` [s] with sampling period `ts` [s]."""
+        return cls(to_nanoseconds(start_time), to_nanoseconds(ts))
+
+    def stamp(self, k: int) -> int:
+        """Instant t_k [ns] of step k."""
+        return self.start_ns + k * self.ts_ns
+
+    def step(self, stamp_ns: int) -> int:
+        """Step k whose instant is `stamp_ns`.
+
+        Raises OffGridError if the stamp lies between two steps or before the first.
+        """
+        k, rest = divmod(stamp_ns - self.start_ns, self.ts_ns)
+        if rest or k < 0:
+            raise OffGridError(
+                f"stamp {stamp_ns / NS_PER_S:.9f} s is not on the grid {self.start_ns / NS_PER_S} s + "
+                f"k * {self.ts_ns / NS_PER_S} s: do all nodes have the same ts and start_time?"
+            )
+        return k

@@ -1,0 +1,236 @@
+"""The loop's messages on the wire: CDR bytes <-> plain values.
+
+rclpy takes and publishes serialised messages as they are (`raw=True`). Building a message object, converting it to C and
+serialising it costs five times as much as packing its few numbers directly, and a control loop consists of little else.
+So the loop's nodes speak CDR themselves, for exactly four types: geometry_msgs/PoseStamped, geometry_msgs/TwistStamped,
+nav_msgs/Odometry and sensor_msgs/TimeReference. Every other message of this project goes through rclpy as usual.
+
+Theory of operation. A CDR stream is a 4-byte encapsulation header (byte 1: 1 little, 0 big endian) and the members in
+order, each aligned to its own size counted from the end of that header. Up to the last string the layout of a type is
+fixed by the lengths of its strings, so a layout is one `struct.Struct`, made once per (byte order, string lengths) and
+kept. Padding is always written as zeros: equal values give equal bytes.
+
+Decoders accept any frame_id, either byte order and trailing bytes, and raise InvalidMessageError, never struct.error, on
+anything else: too short, a number that is not finite, a quaternion that is no rotation.
+
+Source: OMG DDS-RTPS 2.5, 10.2 (encapsulation) and the CORBA CDR rules it refers to; REP 103 (units, yaw about +z).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from functools import lru_cache
+from typing import NamedTuple
+
+from agv_ros.stamps import NS_PER_S
+
+FRAME_MAP = "map"
+FRAME_AGV = "base_link"
+FRAME_REFERENCE = "reference"
+
+DELIVERED = "delivered"
+LOST = "lost"
+
+_HEADER = 4
+_MAX_STRING = 4096
+
+
+class InvalidMessageError(ValueError):
+    """A message that must not enter the loop; the text says what is wrong with it."""
+
+
+class Pose(NamedTuple):
+    """geometry_msgs/PoseStamped: X_c at an instant; x, y [m], theta [rad] in frame `map`."""
+
+    stamp_ns: int
+    x: float
+    y: float
+    theta: float
+
+
+class Command(NamedTuple):
+    """geometry_msgs/TwistStamped: u at an instant; v [m/s], w [rad/s] in frame `base_link`."""
+
+    stamp_ns: int
+    v: float
+    w: float
+
+
+class TrackingError(NamedTuple):
+    """nav_msgs/Odometry: the reference seen from the AGV; x_e, y_e [m], theta_e [rad], v_r [m/s], w_r [rad/s]."""
+
+    stamp_ns: int
+    x_e: float
+    y_e: float
+    theta_e: float
+    v_r: float
+    w_r: float
+
+
+class Slot(NamedTuple):
+    """sensor_msgs/TimeReference: the channel's verdict on one slot and the freshest stamp held behind it (0: none)."""
+
+    stamp_ns: int
+    freshest_ns: int
+    verdict: str
+
+
+def quaternion_of_yaw(theta: float) -> tuple[float, float]:
+    """Components (z, w) of the unit quaternion that turns by `theta` [rad] about +z."""
+    return math.sin(0.5 * theta), math.cos(0.5 * theta)
+
+
+def yaw_of_quaternion(x: float, y: float, z: float, w: float) -> float:
+    """Yaw [rad] in (-pi, pi] of a quaternion, which need not have length one exactly."""
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+@lru_cache(maxsize=64)
+def _layout(order: str, before: str, strings: tuple[int, ...], after: str, alignment: int) -> struct.Struct:
+    """Struct of `before`, then strings of these lengths (length word and text each), then `after` aligned."""
+    fields = before
+    position = struct.calcsize("<" + before)
+    for length in strings:
+        gap = -position % 4
+        fields += f"{gap}xI{length}s"
+        position += gap + 4 + length
+    return struct.Struct(f"{order}{fields}{-position % alignment}x{after}")
+
+
+def _order(data: bytes) -> str:
+    if len(data) < _HEADER + 12 or data[0] != 0 or data[1] > 1:
+        raise InvalidMessageError(f"not a CDR message of this type: {len(data)} bytes")
+    return "<" if data[1] else ">"
+
+
+def _string_length(order: str, data: bytes, position: int) -> int:
+    """Length word of the string at `position`, counted from the end of the encapsulation header."""
+    try:
+        (length,) = struct.unpack_from(order + "I", data, _HEADER + position)
+    except struct.error:
+        raise InvalidMessageError(f"message ends inside a string, after {len(data)} bytes") from None
+    if length > _MAX_STRING:
+        raise InvalidMessageError(f"string of {length} bytes, at most {_MAX_STRING} are accepted")
+    return int(length)
+
+
+def _unpack(layout: struct.Struct, data: bytes) -> tuple[float, ...]:
+    if len(data) < _HEADER + layout.size:
+        raise InvalidMessageError(f"message has {len(data)} bytes, its type needs {_HEADER + layout.size}")
+    return layout.unpack_from(data, _HEADER)
+
+
+def _finite(what: str, values: tuple[float, ...]) -> None:
+    if not all(map(math.isfinite, values)):
+        raise InvalidMessageError(f"{what} is not finite: {', '.join(map(repr, values))}")
+
+
+def _yaw(what: str, x: float, y: float, z: float, w: float) -> float:
+    norm = x * x + y * y + z * z + w * w
+    if not abs(norm - 1.0) < 0.01:
+        raise InvalidMessageError(f"{what} has a quaternion of squared length {norm!r}, must be 1")
+    return yaw_of_quaternion(x, y, z, w)
+
+
+def _split(stamp_ns: int) -> tuple[int, int]:
+    return divmod(stamp_ns, NS_PER_S)
+
+
+def stamp_of(data: bytes) -> int:
+    """Stamp [ns] of any message that begins with a std_msgs/Header or a time (rosgraph_msgs/Clock)."""
+    if len(data) < _HEADER + 8:
+        raise InvalidMessageError(f"message has {len(data)} bytes, too few for a stamp")
+    sec, nanosec = struct.unpack_from("<iI" if data[1] else ">iI", data, _HEADER)
+    return int(sec) * NS_PER_S + int(nanosec)
+
+
+_LITTLE = b"\x00\x01\x00\x00"
+
+
+def encode_clock(stamp_ns: int) -> bytes:
+    """rosgraph_msgs/Clock."""
+    return _LITTLE + struct.pack("<iI", *_split(stamp_ns))
+
+
+def encode_pose(pose: Pose) -> bytes:
+    """geometry_msgs/PoseStamped in frame `map`; z, roll and pitch are zero."""
+    frame = FRAME_MAP.encode() + b"\0"
+    layout = _layout("<", "iI", (len(frame),), "7d", 8)
+    z, w = quaternion_of_yaw(pose.theta)
+    return _LITTLE + layout.pack(*_split(pose.stamp_ns), len(frame), frame, pose.x, pose.y, 0.0, 0.0, 0.0, z, w)
+
+
+def decode_pose(data: bytes) -> Pose:
+    """geometry_msgs/PoseStamped; theta in (-pi, pi]. Raises InvalidMessageError."""
+    order = _order(data)
+    layout = _layout(order, "iI", (_string_length(order, data, 8),), "7d", 8)
+    sec, nanosec, _, _, x, y, _, qx, qy, qz, qw = _unpack(layout, data)
+    _finite("pose", (x, y))
+    return Pose(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("pose", qx, qy, qz, qw))
+
+
+def encode_command(command: Command) -> bytes:
+    """geometry_msgs/TwistStamped in frame `base_link`."""
+    frame = FRAME_AGV.encode() + b"\0"
+    layout = _layout("<", "iI", (len(frame),), "6d", 8)
+    return _LITTLE + layout.pack(
+        *_split(command.stamp_ns), len(frame), frame, command.v, 0.0, 0.0, 0.0, 0.0, command.w
+    )
+
+
+def decode_command(data: bytes) -> Command:
+    """geometry_msgs/TwistStamped. Raises InvalidMessageError."""
+    order = _order(data)
+    layout = _layout(order, "iI", (_string_length(order, data, 8),), "6d", 8)
+    sec, nanosec, _, _, v, _, _, _, _, w = _unpack(layout, data)
+    _finite("command", (v, w))
+    return Command(int(sec) * NS_PER_S + int(nanosec), v, w)
+
+
+def _odometry_layout(order: str, frame: int, child: int) -> struct.Struct:
+    return _layout(order, "iI", (frame, child), "7d288x6d288x", 8)
+
+
+def encode_error(error: TrackingError) -> bytes:
+    """nav_msgs/Odometry: frame_id `base_link`, child_frame_id `reference`; covariances zero (unknown)."""
+    frame, child = FRAME_AGV.encode() + b"\0", FRAME_REFERENCE.encode() + b"\0"
+    layout = _odometry_layout("<", len(frame), len(child))
+    z, w = quaternion_of_yaw(error.theta_e)
+    return _LITTLE + layout.pack(
+        *_split(error.stamp_ns), len(frame), frame, len(child), child,
+        error.x_e, error.y_e, 0.0, 0.0, 0.0, z, w, error.v_r, 0.0, 0.0, 0.0, 0.0, error.w_r,
+    )  # fmt: skip
+
+
+def decode_error(data: bytes) -> TrackingError:
+    """nav_msgs/Odometry; theta_e in (-pi, pi]. Raises InvalidMessageError."""
+    order = _order(data)
+    frame = _string_length(order, data, 8)
+    child = _string_length(order, data, (12 + frame + 3) // 4 * 4)
+    values = _unpack(_odometry_layout(order, frame, child), data)
+    sec, nanosec, _, _, _, _, x, y, _, qx, qy, qz, qw, v, _, _, _, _, w = values
+    _finite("tracking error", (x, y, v, w))
+    return TrackingError(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("tracking error", qx, qy, qz, qw), v, w)
+
+
+def encode_slot(slot: Slot) -> bytes:
+    """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = verdict."""
+    source = slot.verdict.encode() + b"\0"
+    layout = _layout("<", "iI", (1,), f"iII{len(source)}s", 4)
+    return _LITTLE + layout.pack(
+        *_split(slot.stamp_ns), 1, b"\0", *_split(slot.freshest_ns), len(source), source
+    )
+
+
+def decode_slot(data: bytes) -> Slot:
+    """sensor_msgs/TimeReference. Raises InvalidMessageError."""
+    order = _order(data)
+    frame = _string_length(order, data, 8)
+    source = _string_length(order, data, (12 + frame + 3) // 4 * 4 + 8)
+    values = _unpack(_layout(order, "iI", (frame,), f"iII{source}s", 4), data)
+    text = bytes(values[-1])  # type: ignore[call-overload]
+    freshest = int(values[4]) * NS_PER_S + int(values[5])
+    return Slot(
+        int(values[0]) * NS_PER_S + int(values[1]), freshest, text.rstrip(b"\0").decode("utf-8", "replace")
+    )
