@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import uniforms
+from agv_ros.stamps import Grid, Steps
+from agv_ros.wire import DELIVERED, LOST, Slot
 
 _BLOCK = 4096
 
@@ -54,3 +56,21 @@ def losses(parameters: ChannelParameters, seed: int, stream: str, steps: int) ->
     """Verdicts of the slots 0 .. steps - 1, True where lost, shape (steps,)."""
     channel = Channel(parameters, seed, stream)
     return np.fromiter((channel.lost(k) for k in range(steps)), dtype=np.bool_, count=steps)
+
+
+class Link:
+    """A channel and the memory of the receiver behind it."""
+
+    def __init__(self, channel: Channel, grid: Grid) -> None:
+        self.channel = channel
+        self._steps = Steps(grid)
+        self._freshest_ns = 0
+
+    def transmit(self, stamp_ns: int) -> Slot:
+        """The slot of the message with this stamp. Raises OffGridError if the stamp is no sampling instant."""
+        k = self._steps.of(stamp_ns)
+        lost = self.channel.lost(k)
+        if not lost:
+            # Step 0 begins a run: whatever is held of a run before it is not fresher.
+            self._freshest_ns = stamp_ns if k == 0 else max(self._freshest_ns, stamp_ns)
+        return Slot(stamp_ns, self._freshest_ns, LOST if lost else DELIVERED)

@@ -47,3 +47,26 @@ class Grid(NamedTuple):
                 f"k * {self.ts_ns / NS_PER_S} s: do all nodes have the same ts and start_time?"
             )
         return k
+
+
+MAX_LEAP = 1_000_000
+"""Most steps between two messages of a run that are believed: 83 minutes at 5 ms."""
+
+
+class Steps:
+    """Steps of a running loop: as `Grid.step`, but one wild stamp cannot send a node far into the future."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self._last = 0
+
+    def of(self, stamp_ns: int) -> int:
+        """Step of a stamp. Raises OffGridError for no sampling instant, or one MAX_LEAP steps past the last."""
+        k = self._grid.step(stamp_ns)
+        if k > self._last + MAX_LEAP:
+            raise OffGridError(
+                f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, {k - self._last} steps after the last one seen; "
+                f"at most {MAX_LEAP} are believed"
+            )
+        self._last = k
+        return k

@@ -1,0 +1,36 @@
+"""The command that the AGV obeys in real time: the newest one, until it is too old."""
+
+from __future__ import annotations
+
+from agv_ros.wire import Command
+
+
+class HeldCommand:
+    """Zero-order hold with a limit on age.
+
+    `outdated` counts commands that came after a newer one, `stops` how often the AGV was stopped for want of a command.
+    """
+
+    def __init__(self, timeout_ns: int) -> None:
+        self._timeout_ns = timeout_ns
+        self._newest: Command | None = None
+        self._stopped = False
+        self.outdated = 0
+        self.stops = 0
+
+    def offer(self, command: Command) -> None:
+        """Take a command; one that is older than the newest is not obeyed."""
+        if self._newest is not None and command.stamp_ns < self._newest.stamp_ns:
+            self.outdated += 1
+            return
+        self._newest = command
+
+    def at(self, stamp_ns: int) -> Command:
+        """The command to obey at an instant: standing still before the first and beyond the limit on age."""
+        newest = self._newest
+        if newest is None:
+            return Command(stamp_ns, 0.0, 0.0)
+        too_old = stamp_ns - newest.stamp_ns > self._timeout_ns
+        self.stops += too_old and not self._stopped
+        self._stopped = too_old
+        return Command(stamp_ns, 0.0, 0.0) if too_old else newest

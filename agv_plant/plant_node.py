@@ -1,0 +1,180 @@
+"""The AGV: publishes its pose, obeys the commands that arrive, and keeps the loop's clock.
+
+lockstep: step k + 1 follows the answer to step k, as fast as it comes. realtime: one step every T_s, with the newest
+command held; the AGV stops when that is too old.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from rclpy.clock import Clock as RosClock
+from rclpy.clock import ClockType
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import TimeReference
+
+from agv_plant.held_command import HeldCommand
+from agv_plant.parameters import PlantParameters
+from agv_plant.punctuality import Punctuality
+from agv_plant.unicycle import STEPS, State
+from agv_ros.executor import run_node
+from agv_ros.node import LoopNode
+from agv_ros.slot_join import Joined, SlotJoin
+from agv_ros.stamps import to_nanoseconds
+from agv_ros.wire import (
+    Command,
+    InvalidMessageError,
+    Pose,
+    decode_command,
+    decode_slot,
+    encode_clock,
+    encode_pose,
+    stamp_of,
+)
+
+_REPEAT_AFTER = 0.5
+"""Lockstep: step 0 is sent again after this time [s] without an answer, since a peer may have come up after it."""
+
+_PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_vel", "controller"))
+"""A topic that each peer publishes, in the order in which a step passes them."""
+
+
+class PlantNode(LoopNode[PlantParameters]):
+    """Owns the state X_c(k) and says when k becomes k + 1."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("plant", PlantParameters, **node_options)
+        settings = self.settings
+        self.k = 0
+        self.steps = math.inf if math.isinf(settings.duration) else max(1, round(settings.duration / settings.ts))
+        self.state = State(*settings.initial_pose)
+        self._step = STEPS[settings.integration]
+        self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
+        self._held = HeldCommand(to_nanoseconds(settings.cmd_vel_timeout))
+        self.punctuality = Punctuality(self.grid.ts_ns)
+        self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
+        self._lockstep = settings.clock == "lockstep"
+        self._pose_out = self.output(PoseStamped, "agv/pose")
+        self._clock_out = self.output(Clock, "/clock", side=True)
+        self.input(TwistStamped, "agv/cmd_vel", self._on_command)
+        self.input(TimeReference, "agv/slot", self._on_slot)
+        if self._lockstep:
+            self._watch_for_answers()
+        self.poll(self._begin)
+
+    def _begin(self) -> bool:
+        wanted = max(self.settings.wait_for_subscribers, self._lockstep)
+        if not all(output.is_heard(wanted) for output in self.outputs):
+            return False
+        if self.count_publishers("agv/pose") > 1:
+            self.fail(f"another plant publishes {self._pose_out.topic}: use another namespace or ROS_DOMAIN_ID")
+        elif self._lockstep:
+            self._publish()
+        else:
+            self._keep_time()
+        return True
+
+    # -- the loop ----------------------------------------------------------------------------------------------------
+
+    def _publish(self) -> None:
+        stamp_ns = self.grid.stamp(self.k)
+        self.report_every_second(stamp_ns)
+        self._clock_out.publish(encode_clock(stamp_ns))
+        self._pose_out.publish(encode_pose(Pose(stamp_ns, *self.state)))
+
+    def _advance(self, command: Command) -> None:
+        """From step k to k + 1 under a command."""
+        state = State(*self._step(*self.state, command.v, command.w, self.settings.ts))
+        if not all(map(math.isfinite, state)):
+            self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")
+            return
+        self.state = state
+        self.k += 1
+        if self.k >= self.steps:
+            self.finished = True
+        else:
+            self._publish()
+
+    def _on_command(self, data: bytes) -> None:
+        try:
+            command = decode_command(data)
+        except InvalidMessageError:
+            self._answer(self._join.reject(stamp_of(data)))
+            raise
+        if self._lockstep:
+            self._answer(self._join.add_message(command))
+        else:
+            self._held.offer(command)
+
+    def _on_slot(self, data: bytes) -> None:
+        slot = decode_slot(data)
+        if self._lockstep:
+            self._answer(self._join.add_slot(slot))
+
+    # -- lockstep ----------------------------------------------------------------------------------------------------
+
+    def _answer(self, ready: list[Joined[Command]]) -> None:
+        for slot, command in ready:
+            if slot.stamp_ns == self.grid.stamp(self.k) and not self.finished:
+                self._advance(command or Command(slot.stamp_ns, 0.0, 0.0))
+
+    def _watch_for_answers(self) -> None:
+        """Give up, naming the missing peer, when a step stays without an answer for too long."""
+        seen, since, repeated = -1, time.monotonic(), time.monotonic()
+
+        def watch() -> None:
+            nonlocal seen, since, repeated
+            now = time.monotonic()
+            if self.k != seen:
+                seen, since = self.k, now
+            elif now - since > self.settings.answer_timeout:
+                self.fail(self._no_answer())
+            elif self.k == 0 and now - max(since, repeated) > _REPEAT_AFTER and self._pose_out.count:
+                repeated = now
+                self._pose_out.publish(encode_pose(Pose(self.grid.stamp(0), *self.state)))
+
+        self.create_timer(min(0.1, self.settings.answer_timeout / 4.0), watch, clock=self._steady)
+
+    def _no_answer(self) -> str:
+        silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)
+        question = (
+            f"is the {silent} running?"
+            if silent
+            else "all nodes are there: do they have the same ts and start_time, and does each hear the one before it?"
+        )
+        return (
+            f"no answer to step {self.k} on agv/cmd_vel within {self.settings.answer_timeout:g} s: {question}"
+        )
+
+    # -- realtime ----------------------------------------------------------------------------------------------------
+
+    def _keep_time(self) -> None:
+        self.punctuality.start(time.monotonic_ns())
+        self._publish()
+        self.create_timer(self.settings.ts, self._tick, clock=self._steady)
+
+    def _tick(self) -> None:
+        due = self.punctuality.tick(time.monotonic_ns())
+        while self.k < due and not self.finished:
+            self._advance(self._held.at(self.grid.stamp(self.k + 1)))
+
+    def facts(self) -> dict[str, str]:
+        """Progress; in realtime also punctuality and what became of commands."""
+        facts = {"step": str(self.k)}
+        if not self._lockstep:
+            facts |= {name: f"{value:.6g}" for name, value in self.punctuality.summary().items()}
+            facts |= {"stops without command": str(self._held.stops), "outdated commands": str(self._held.outdated)}
+        return facts
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of the executable `plant`."""
+    run_node(PlantNode, args)
+
+
+if __name__ == "__main__":
+    main()

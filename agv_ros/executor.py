@@ -1,0 +1,99 @@
+"""Running nodes: one process for one node, ended cleanly by SIGINT, SIGTERM or the node itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+# The loop is one machine's business unless its user says otherwise; set before rclpy makes its first participant.
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from agv_ros.node import LoopNode
+
+EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "single": SingleThreadedExecutor}
+
+SPIN_TIMEOUT = 0.05
+"""Longest wait [s] for the next event. Unbounded, the events executor neither runs timers nor sees signals."""
+
+FLUSH_TIMEOUT = 0.5
+"""How long [s] a node that ends waits for a subscriber that still has not got everything."""
+
+
+class Stop:
+    """Set by SIGINT and SIGTERM."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def request(self, *_: object) -> None:
+        """Signal handler."""
+        self.requested = True
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """Turn SIGINT and SIGTERM into a flag: a loop ends between two events, not in the middle of one."""
+    stop = Stop()
+    before = {number: signal.signal(number, stop.request) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def spin(executor: Executor, is_done: Callable[[], bool]) -> None:
+    """Run callbacks until `is_done`."""
+    while not is_done():
+        try:
+            executor.spin_once(timeout_sec=SPIN_TIMEOUT)
+        except ExternalShutdownException:
+            return
+
+
+def spin_for(executor: Executor, is_done: Callable[[], bool], seconds: float) -> bool:
+    """Run callbacks until `is_done`, `seconds` at most; did it become true?"""
+    deadline = time.monotonic() + seconds
+    spin(executor, lambda: is_done() or time.monotonic() > deadline)
+    return is_done()
+
+
+def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = None) -> None:
+    """Body of a node's `main`: make it, run it until it ends or is told to stop, and exit with its status.
+
+    What is wrong with a parameter or a file is said in one line, with exit status 1.
+    """
+    with stop_on_signals() as stop:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            failure = _run(make, stop)
+        finally:
+            rclpy.try_shutdown()
+    if failure:
+        print(failure, file=sys.stderr)
+        raise SystemExit(1)
+
+
+def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
+    try:
+        node = make()
+    except ValueError as error:  # ParameterError and its like name the parameter or the file
+        return str(error)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    spin(executor, lambda: node.finished or stop.requested)
+    node.close()
+    node.flush(FLUSH_TIMEOUT)
+    executor.shutdown()
+    node.destroy_node()
+    return node.failure

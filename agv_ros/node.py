@@ -1,0 +1,249 @@
+"""What the loop's nodes have in common: typed parameters, raw topics, counted rejections, diagnostics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.duration import Duration
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterUninitializedException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.time import Time
+
+from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
+from agv_ros.stamps import Grid, to_nanoseconds
+from agv_ros.wire import InvalidMessageError, stamp_of
+
+P = TypeVar("P", bound=LoopParameters)
+
+# Deep enough that a reader which falls behind for a moment, the recorder above all, still gets every message.
+LOOP_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+
+_POLL_PERIOD = 0.01
+"""How often [s] a node looks for its subscribers and peers while it waits for them."""
+
+
+class Output:
+    """A publisher of serialised messages that counts them."""
+
+    def __init__(self, publisher: Publisher, side: bool) -> None:
+        self._publisher = publisher
+        self._side = side
+        self.count = 0
+        self.topic: str = publisher.topic_name
+
+    def publish(self, data: bytes) -> None:
+        """Send one serialised message."""
+        self.count += 1
+        self._publisher.publish(data)
+
+    def is_heard(self, subscribers: int) -> bool:
+        """Has the topic this many subscribers? One fewer is enough beside the loop: only a recorder listens there."""
+        return self._publisher.get_subscription_count() >= subscribers - self._side
+
+    def flush(self, seconds: float) -> None:
+        """Wait until every subscriber has what was sent, `seconds` at most."""
+        self._publisher.wait_for_all_acked(Duration(nanoseconds=to_nanoseconds(seconds)))
+
+
+class LoopNode(Node, Generic[P]):
+    """Base of the loop's nodes.
+
+    `settings` are the parameters as they are now; `finished` turns True when the node has done its work, `failure`
+    then says why if it did not succeed.
+    """
+
+    def __init__(self, name: str, schema: type[P], **node_options: Any) -> None:
+        super().__init__(name, **node_options)
+        self.settings: P = _declare(self, schema)
+        self.grid = Grid.of(self.settings.start_time, self.settings.ts)
+        self.rejected: Counter[str] = Counter()
+        self.finished = False
+        self.failure = ""
+        self.outputs: list[Output] = []
+        self._steps_per_report = max(1, round(1.0 / self.settings.ts))
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", LOOP_QOS)
+        self.diagnostics_output = Output(self._diagnostics, side=True)
+        self.outputs.append(self.diagnostics_output)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+
+    # -- topics ------------------------------------------------------------------------------------------------------
+
+    def output(self, kind: type, topic: str, *, side: bool = False) -> Output:
+        """Publisher of serialised messages of type `kind`; `side`: no node of the loop listens to it."""
+        publisher = self.create_publisher(
+            kind, topic, LOOP_QOS, qos_overriding_options=QoSOverridingOptions.with_default_policies()
+        )
+        self.outputs.append(Output(publisher, side))
+        return self.outputs[-1]
+
+    def input(self, kind: type, topic: str, callback: Callable[[bytes], None], *feeds: Output) -> None:
+        """Subscription to serialised messages; what `callback` refuses is counted under `topic`.
+
+        It is made as soon as each output that it `feeds` has the wanted number of subscribers. A loop thus comes up
+        backwards, from the plant's inputs to its output, and its first message is not lost.
+        """
+
+        def receive(data: bytes) -> None:
+            try:
+                callback(data)
+            except ValueError as error:  # InvalidMessageError, OffGridError
+                self.reject(topic, data, error)
+
+        def subscribe_when_heard() -> bool:
+            if not all(output.is_heard(self.settings.wait_for_subscribers) for output in feeds):
+                return False
+            self.create_subscription(
+                kind, topic, receive, LOOP_QOS, raw=True,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )  # fmt: skip
+            return True
+
+        self.poll(subscribe_when_heard)
+
+    def poll(self, attempt: Callable[[], bool]) -> None:
+        """Call `attempt` now and, until it returns True, again and again."""
+        if attempt():
+            return
+
+        def again() -> None:
+            if attempt():
+                self.destroy_timer(timer)
+
+        timer = self.create_timer(_POLL_PERIOD, again)
+
+    def close(self) -> None:
+        """Called once, after the last callback: bring to an end what the node holds open."""
+
+    def flush(self, seconds: float) -> None:
+        """Wait until all that was published has arrived, `seconds` per output at most."""
+        for output in self.outputs:
+            output.flush(seconds)
+
+    # -- what went wrong ---------------------------------------------------------------------------------------------
+
+    def reject(self, topic: str, data: bytes, error: ValueError) -> None:
+        """Count a message that must not enter the loop; the first of its topic is logged."""
+        self.rejected[topic] += 1
+        if self.rejected[topic] == 1:
+            self.get_logger().warning(f"{topic}: message rejected: {error}; further ones are only counted")
+        count = self.rejected[topic]
+        if count & (count - 1) == 0:
+            try:
+                self.report(stamp_of(data))
+            except InvalidMessageError:
+                self.report(self.grid.start_ns)
+
+    def fail(self, reason: str) -> None:
+        """End this node with an error."""
+        self.failure = reason
+        self.finished = True
+
+    # -- diagnostics -------------------------------------------------------------------------------------------------
+
+    def facts(self) -> dict[str, str]:
+        """What this node has to say of itself in its diagnostics, beside what it rejected."""
+        return {}
+
+    def report_every_second(self, stamp_ns: int) -> None:
+        """Publish diagnostics once per second of the loop's time, at whole seconds after step 0."""
+        if self.grid.step(stamp_ns) % self._steps_per_report == 0:
+            self.report(stamp_ns)
+
+    def report(self, stamp_ns: int) -> None:
+        """Publish this node's diagnostics now."""
+        total = sum(self.rejected.values())
+        facts = self.facts() | {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if total else DiagnosticStatus.OK,
+            name=self.get_fully_qualified_name().lstrip("/"),
+            message=f"{total} messages rejected" if total else "ok",
+            values=[KeyValue(key=key, value=value) for key, value in facts.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = Time(nanoseconds=max(0, stamp_ns)).to_msg()
+        self.diagnostics_output.count += 1
+        self._diagnostics.publish(message)
+
+    # -- parameters --------------------------------------------------------------------------------------------------
+
+    def on_settings(self) -> None:
+        """Called when `settings` have changed while the node runs."""
+
+    def _on_set_parameters(self, parameters: list[RosParameter[Any]]) -> SetParametersResult:
+        known = parameters_of(type(self.settings))
+        changed = {p.name: p.value for p in parameters if p.name in known}
+        try:
+            settings = build(type(self.settings), as_dict(self.settings) | changed, self.get_name())
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self.settings = settings
+        self.on_settings()
+        return SetParametersResult(successful=True)
+
+
+def _declare(node: Node, schema: type[P]) -> P:
+    """Declare a schema's parameters and read their values. Raises ParameterError."""
+    values = {}
+    for name, parameter in parameters_of(schema).items():
+        default = list(parameter.default) if parameter.kind == "double_array" else parameter.default
+        try:
+            values[name] = node.declare_parameter(name, default, _descriptor(parameter)).value
+        except InvalidParameterTypeException as error:
+            found: Any = getattr(error, "parameter", None)
+            value = found.value if isinstance(found, RosParameter) else _override(node, name)
+            parameter.check(node.get_name(), value)
+            raise ParameterError(f"{node.get_name()}.{name} is a {parameter.kind}: {error}") from None
+        except (InvalidParameterValueException, ParameterUninitializedException):
+            parameter.check(node.get_name(), _override(node, name))
+            raise ParameterError(f"{node.get_name()}.{name} must be {parameter.allowed}") from None
+    return build(schema, {name: _plain(value) for name, value in values.items()}, node.get_name())
+
+
+def _override(node: Node, name: str) -> Any:
+    """The value that was asked for from outside (rclpy has no public name for it)."""
+    override = node._parameter_overrides.get(name)
+    return None if override is None else override.value
+
+
+def _plain(value: Any) -> Any:
+    """Array parameters arrive as array.array."""
+    return tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
+
+
+def _descriptor(parameter: Parameter) -> ParameterDescriptor:
+    unit = f" [{parameter.unit}]" if parameter.unit else ""
+    descriptor = ParameterDescriptor(
+        description=parameter.description + unit,
+        additional_constraints=f"must be {parameter.allowed}" if parameter.kind != "bool" else "",
+        read_only=not parameter.runtime,
+    )
+    low = parameter.low if parameter.low is not None else parameter.above
+    if low is not None and parameter.high is not None:
+        if parameter.kind == "integer":
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(parameter.high), step=0)]
+        elif parameter.kind == "double" and not math.isinf(low):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=parameter.high, step=0.0)]
+    return descriptor
+
+
+def overrides(settings: object) -> list[RosParameter[Any]]:
+    """rclpy parameter overrides that give a node exactly these settings."""
+    assert dataclasses.is_dataclass(settings)
+    return [
+        RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
+        for name, value in as_dict(settings).items()
+    ]
