@@ -47,13 +47,14 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self.report_every_second(slot.stamp_ns)
 
     def _answer(self, ready: list[Joined[Pose]]) -> None:
-        for slot, pose in ready:
+        for joined in ready:
+            stamp_ns, pose = joined.slot.stamp_ns, joined.message
             if pose is None:
                 self._blind += 1
                 continue
-            target = self.reference[self.grid.step(slot.stamp_ns)]
+            target = self.reference[self.grid.step(stamp_ns)]
             eps = tracking_error(target.x, target.y, target.theta, pose.x, pose.y, pose.theta)
-            self._error_out.publish(encode_error(TrackingError(slot.stamp_ns, *eps, target.v, target.w)))
+            self._error_out.publish(encode_error(TrackingError(stamp_ns, *eps, target.v, target.w)))
 
     def facts(self) -> dict[str, str]:
         """Slots that were not answered, by reason."""

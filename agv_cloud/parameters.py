@@ -42,9 +42,5 @@ class ControllerParameters(LoopParameters):
 
     kx: float = parameter(25.0, "gain K_x of the error along the track", unit="1/s", low=0.0, high=1e6, runtime=True)
     ky: float = parameter(1.0, "gain K_y of the error across the track", unit="1/m^2", low=0.0, high=1e6, runtime=True)
-    ktheta: float = parameter(
-        2.0, "gain K_theta of the error of heading", unit="1/m", low=0.0, high=1e6, runtime=True
-    )
-    v_max: float = parameter(
-        math.inf, "limit on |v|, .inf: none", unit="m/s", above=0.0, high=math.inf, runtime=True
-    )
+    ktheta: float = parameter(2.0, "gain K_theta of the error of heading", unit="1/m", low=0.0, high=1e6, runtime=True)
+    v_max: float = parameter(math.inf, "limit on |v|, .inf: none", unit="m/s", above=0.0, high=math.inf, runtime=True)

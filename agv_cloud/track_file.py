@@ -8,9 +8,10 @@ import math
 from collections.abc import Iterable
 
 from agv_cloud.tracks import Speeds
+from agv_ros.errors import UserError
 
 
-class TrackFileError(ValueError):
+class TrackFileError(UserError):
     """A track file that cannot be used; the text names file, line and reason."""
 
 

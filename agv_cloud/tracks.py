@@ -50,8 +50,8 @@ def warehouse(k: int, n: int, ts: float, speed: float) -> Speeds:
     """A rectangle with clothoid corners and a full stop in the middle of either long side.
 
     Both halves of the lap are the same motion, turned by pi against each other, so the lap closes exactly. Half a lap:
-    straight with a stop (40 %), corner (15 %), straight (30 %), corner (15 %). In a corner the curvature rises and falls
-    linearly; sampled at interval midpoints its sum is pi / 2 exactly.
+    straight with a stop (40 %), corner (15 %), straight (30 %), corner (15 %). In a corner the curvature rises and
+    falls linearly; sampled at interval midpoints its sum is pi / 2 exactly.
     """
     half = n // 2
     corner = 2 * (3 * half // 40)

@@ -44,9 +44,7 @@ class ChannelParameters:
         0.0, "bernoulli: loss probability; gilbert_elliott: probability of good to bad, per slot", low=0.0, high=1.0,
         runtime=True,
     )  # fmt: skip
-    r: float = parameter(
-        1.0, "gilbert_elliott: probability of bad to good, per slot", low=0.0, high=1.0, runtime=True
-    )
+    r: float = parameter(1.0, "gilbert_elliott: probability of bad to good, per slot", low=0.0, high=1.0, runtime=True)
     h: float = parameter(
         0.0, "gilbert_elliott: probability of delivery in the bad state", low=0.0, high=1.0, runtime=True
     )

@@ -7,6 +7,7 @@ command held; the AGV stops when that is too old.
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -43,6 +44,17 @@ _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_v
 """A topic that each peer publishes, in the order in which a step passes them."""
 
 
+def progress_line(k: int, steps: float) -> str:
+    """What the plant logs of its progress."""
+    return f"step {k} of {steps}"
+
+
+def progress_of(line: str) -> int | None:
+    """The step in a line of the plant's log, None if it speaks of something else."""
+    found = re.search(r"step (\d+) of \S+$", line)
+    return int(found[1]) if found else None
+
+
 class PlantNode(LoopNode[PlantParameters]):
     """Owns the state X_c(k) and says when k becomes k + 1."""
 
@@ -51,6 +63,7 @@ class PlantNode(LoopNode[PlantParameters]):
         settings = self.settings
         self.k = 0
         self.steps = math.inf if math.isinf(settings.duration) else max(1, round(settings.duration / settings.ts))
+        self._steps_per_line = max(1, round(self.steps / 20 if math.isfinite(self.steps) else 10.0 / settings.ts))
         self.state = State(*settings.initial_pose)
         self._step = STEPS[settings.integration]
         self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
@@ -98,6 +111,8 @@ class PlantNode(LoopNode[PlantParameters]):
             self.finished = True
         else:
             self._publish()
+        if self.k % self._steps_per_line == 0:
+            self.get_logger().info(progress_line(self.k, self.steps))
 
     def _on_command(self, data: bytes) -> None:
         try:
@@ -118,9 +133,10 @@ class PlantNode(LoopNode[PlantParameters]):
     # -- lockstep ----------------------------------------------------------------------------------------------------
 
     def _answer(self, ready: list[Joined[Command]]) -> None:
-        for slot, command in ready:
-            if slot.stamp_ns == self.grid.stamp(self.k) and not self.finished:
-                self._advance(command or Command(slot.stamp_ns, 0.0, 0.0))
+        for joined in ready:
+            stamp_ns = joined.slot.stamp_ns
+            if stamp_ns == self.grid.stamp(self.k) and not self.finished:
+                self._advance(joined.message or Command(stamp_ns, 0.0, 0.0))
 
     def _watch_for_answers(self) -> None:
         """Give up, naming the missing peer, when a step stays without an answer for too long."""
@@ -146,9 +162,7 @@ class PlantNode(LoopNode[PlantParameters]):
             if silent
             else "all nodes are there: do they have the same ts and start_time, and does each hear the one before it?"
         )
-        return (
-            f"no answer to step {self.k} on agv/cmd_vel within {self.settings.answer_timeout:g} s: {question}"
-        )
+        return f"no answer to step {self.k} on agv/cmd_vel within {self.settings.answer_timeout:g} s: {question}"
 
     # -- realtime ----------------------------------------------------------------------------------------------------
 

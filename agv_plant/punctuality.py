@@ -37,7 +37,7 @@ class Punctuality:
         return number
 
     def summary(self) -> dict[str, float]:
-        """|period - T_s| [s] at p50, p99 and at most, over the last 100 000 ticks, and the number of missed deadlines."""
+        """|period - T_s| [s] at p50, p99 and at most, over the last 100 000 ticks, and the missed deadlines."""
         jitter = np.array(self._jitter_ns, dtype=np.float64) * 1e-9
         if not len(jitter):
             return {"jitter p50": 0.0, "jitter p99": 0.0, "jitter max": 0.0, "missed deadlines": float(self.missed)}

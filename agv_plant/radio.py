@@ -19,8 +19,8 @@ _BLOCK = 4096
 class Channel:
     """Verdicts of one channel, a pure function of (parameters, seed, stream name, k).
 
-    The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot 0,
-    so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
+    The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot
+    0, so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
     """
 
     def __init__(self, parameters: ChannelParameters, seed: int, stream: str) -> None:

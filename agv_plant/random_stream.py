@@ -18,6 +18,6 @@ DRAWS = 4
 def uniforms(seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
     """Numbers uniform in [0, 1) of the slots first .. first + count - 1, shape (count, DRAWS)."""
     key = int.from_bytes(hashlib.sha256(f"{seed}/{stream}".encode()).digest()[:16], "little")
-    raw = np.random.Philox(key=key, counter=first).random_raw(count * DRAWS)
+    raw: NDArray[np.uint64] = np.random.Philox(key=key, counter=first).random_raw(count * DRAWS)
     # The top 53 bits fill a double's mantissa exactly.
-    return ((raw >> np.uint64(11)) * 2.0**-53).reshape(count, DRAWS)
+    return np.asarray((raw >> np.uint64(11)) * 2.0**-53).reshape(count, DRAWS)

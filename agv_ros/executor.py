@@ -18,6 +18,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.experimental import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from agv_ros.errors import UserError
 from agv_ros.node import LoopNode
 
 EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "single": SingleThreadedExecutor}
@@ -87,7 +88,7 @@ def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = No
 def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     try:
         node = make()
-    except ValueError as error:  # ParameterError and its like name the parameter or the file
+    except UserError as error:
         return str(error)
     executor = EventsExecutor()
     executor.add_node(node)

@@ -52,7 +52,7 @@ class Output:
 
     def is_heard(self, subscribers: int) -> bool:
         """Has the topic this many subscribers? One fewer is enough beside the loop: only a recorder listens there."""
-        return self._publisher.get_subscription_count() >= subscribers - self._side
+        return bool(self._publisher.get_subscription_count() >= subscribers - self._side)
 
     def flush(self, seconds: float) -> None:
         """Wait until every subscriber has what was sent, `seconds` at most."""

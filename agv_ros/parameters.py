@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from agv_ros.errors import UserError
+
 T = TypeVar("T")
 
 
-class ParameterError(ValueError):
+class ParameterError(UserError):
     """A parameter that was refused; the text names it, what was found, what is allowed."""
 
 
@@ -114,14 +115,16 @@ def parameter(
     `low` and `high` are included, `above` is not; a double is finite unless `high` is inf. A `runtime` parameter can be
     changed while the node runs. A tuple default makes a double_array of that length.
     """
-    meta = {"description": description, "unit": unit, "low": low, "high": high, "above": above}
-    meta.update(choices=choices, runtime=runtime)
-    return typing.cast(T, dataclasses.field(default=default, metadata={"parameter": meta}))
+    known = {
+        "description": description, "unit": unit, "low": low, "high": high, "above": above, "choices": choices,
+        "runtime": runtime,
+    }  # fmt: skip
+    return dataclasses.field(default=default, metadata={"parameter": known})
 
 
 def group(schema: type[T]) -> T:
     """Dataclass field for a nested dataclass of parameters; its names get this field's name and a dot before them."""
-    return typing.cast(T, dataclasses.field(default_factory=schema, metadata={"group": schema}))
+    return dataclasses.field(default_factory=schema, metadata={"group": schema})
 
 
 _KINDS = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double_array"}

@@ -1,17 +1,18 @@
 """Pairing a slot's verdict with the message that it speaks of.
 
 Theory of operation. The relay sends two messages for a slot: the forwarded one, if it was delivered, and the verdict,
-always. They travel on two topics, so either may come first. The verdict names the stamp of the freshest message that the
-receiver holds behind the channel; the receiver acts on the verdict once it holds exactly that message. Thus what a node
-computes depends on stamps alone, never on the order of arrival. The error detector joins poses with uplink slots, the
-plant in lockstep commands with downlink slots: this join is the barrier that makes the loop deterministic.
+always. They travel on two topics, so either may come first. The verdict names the stamp of the freshest message that
+the receiver holds behind the channel; the receiver acts on the verdict once it holds exactly that message. Thus what a
+node computes depends on stamps alone, never on the order of arrival. The error detector joins poses with uplink slots,
+the plant in lockstep commands with downlink slots: this join is the barrier that makes the loop deterministic.
 
 No clock, no thread, no ROS in here: messages go in, pairs that are complete come out.
 """
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 from agv_ros.wire import Slot
 
@@ -28,7 +29,8 @@ class Stamped(Protocol):
 M = TypeVar("M", bound=Stamped)
 
 
-class Joined(NamedTuple, Generic[M]):
+@dataclass(frozen=True)  # not a NamedTuple: Python 3.10 has no generic ones
+class Joined(Generic[M]):
     """A slot with the freshest message held at it; None if there has been none that could be used."""
 
     slot: Slot

@@ -1,17 +1,18 @@
 """The loop's messages on the wire: CDR bytes <-> plain values.
 
-rclpy takes and publishes serialised messages as they are (`raw=True`). Building a message object, converting it to C and
-serialising it costs five times as much as packing its few numbers directly, and a control loop consists of little else.
-So the loop's nodes speak CDR themselves, for exactly four types: geometry_msgs/PoseStamped, geometry_msgs/TwistStamped,
-nav_msgs/Odometry and sensor_msgs/TimeReference. Every other message of this project goes through rclpy as usual.
+rclpy takes and publishes serialised messages as they are (`raw=True`). Building a message object, converting it to C
+and serialising it costs five times as much as packing its few numbers directly, and a control loop consists of little
+else. So the loop's nodes speak CDR themselves, for exactly four types: geometry_msgs/PoseStamped,
+geometry_msgs/TwistStamped, nav_msgs/Odometry and sensor_msgs/TimeReference. Every other message of this project goes
+through rclpy as usual.
 
 Theory of operation. A CDR stream is a 4-byte encapsulation header (byte 1: 1 little, 0 big endian) and the members in
 order, each aligned to its own size counted from the end of that header. Up to the last string the layout of a type is
 fixed by the lengths of its strings, so a layout is one `struct.Struct`, made once per (byte order, string lengths) and
 kept. Padding is always written as zeros: equal values give equal bytes.
 
-Decoders accept any frame_id, either byte order and trailing bytes, and raise InvalidMessageError, never struct.error, on
-anything else: too short, a number that is not finite, a quaternion that is no rotation.
+Decoders accept any frame_id, either byte order and trailing bytes, and raise InvalidMessageError, never struct.error,
+on anything else: too short, a number that is not finite, a quaternion that is no rotation.
 
 Source: OMG DDS-RTPS 2.5, 10.2 (encapsulation) and the CORBA CDR rules it refers to; REP 103 (units, yaw about +z).
 """
@@ -174,9 +175,7 @@ def encode_command(command: Command) -> bytes:
     """geometry_msgs/TwistStamped in frame `base_link`."""
     frame = FRAME_AGV.encode() + b"\0"
     layout = _layout("<", "iI", (len(frame),), "6d", 8)
-    return _LITTLE + layout.pack(
-        *_split(command.stamp_ns), len(frame), frame, command.v, 0.0, 0.0, 0.0, 0.0, command.w
-    )
+    return _LITTLE + layout.pack(*_split(command.stamp_ns), len(frame), frame, command.v, 0.0, 0.0, 0.0, 0.0, command.w)
 
 
 def decode_command(data: bytes) -> Command:
@@ -218,9 +217,7 @@ def encode_slot(slot: Slot) -> bytes:
     """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = verdict."""
     source = slot.verdict.encode() + b"\0"
     layout = _layout("<", "iI", (1,), f"iII{len(source)}s", 4)
-    return _LITTLE + layout.pack(
-        *_split(slot.stamp_ns), 1, b"\0", *_split(slot.freshest_ns), len(source), source
-    )
+    return _LITTLE + layout.pack(*_split(slot.stamp_ns), 1, b"\0", *_split(slot.freshest_ns), len(source), source)
 
 
 def decode_slot(data: bytes) -> Slot:
@@ -231,6 +228,4 @@ def decode_slot(data: bytes) -> Slot:
     values = _unpack(_layout(order, "iI", (frame,), f"iII{source}s", 4), data)
     text = bytes(values[-1])  # type: ignore[call-overload]
     freshest = int(values[4]) * NS_PER_S + int(values[5])
-    return Slot(
-        int(values[0]) * NS_PER_S + int(values[1]), freshest, text.rstrip(b"\0").decode("utf-8", "replace")
-    )
+    return Slot(int(values[0]) * NS_PER_S + int(values[1]), freshest, text.rstrip(b"\0").decode("utf-8", "replace"))
