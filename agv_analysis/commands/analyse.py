@@ -1,0 +1,40 @@
+"""`agv-ncs analyse`: a verdict from a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from agv_analysis.commands import write_json
+
+
+@click.command("analyse")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+@click.option(
+    "--config", type=click.Path(path_type=Path), help="The run's params file, for a bag that does not carry it."
+)
+@click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
+def command(bag: Path, json_file: Path | None, config: Path | None, picture: Path | None) -> None:
+    r"""Say from the recording BAG whether the loop is stable, and why.
+
+    \b
+    Examples:
+      agv-ncs analyse bags/first
+      agv-ncs analyse bags/first --json first.json --picture first.png
+      agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
+    """
+    from agv_analysis.analysis import analyse as analyse_run
+    from agv_analysis.picture import draw
+    from agv_analysis.recording import read_run
+    from agv_analysis.table import print_table
+
+    run_ = read_run(bag, config)
+    analysis = analyse_run(run_)
+    where = picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png"))
+    draw(run_, where)
+    print_table(analysis)
+    click.echo(f"bag:     {bag}\npicture: {where}")
+    if json_file is not None:
+        write_json(json_file, analysis.to_json())

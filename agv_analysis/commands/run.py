@@ -1,0 +1,62 @@
+"""`agv-ncs run`: the loop on DDS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from agv_analysis.commands import with_settings
+
+
+@click.command("run")
+@with_settings
+@click.option("--bag", type=click.Path(path_type=Path), help="Record to this directory, which must not exist.")
+@click.option("--clock", type=click.Choice(["lockstep", "realtime"]), help="As --set plant.clock=...")
+@click.option("--processes", is_flag=True, help="One process for each node instead of one for all.")
+@click.option("--duration", type=float, help="As --set plant.duration=... [s]; cuts the run short.")
+@click.option("--seed", type=int, help="As --set relay.seed=...")
+def command(
+    params: str,
+    settings: tuple[str, ...],
+    bag: Path | None,
+    clock: str | None,
+    processes: bool,
+    duration: float | None,
+    seed: int | None,
+) -> None:
+    r"""Run the loop of the params file PARAMS on DDS.
+
+    \b
+    Examples:
+      agv-ncs run config/paper.yaml
+      agv-ncs run config/outages.yaml --bag bags/first --seed 7
+      agv-ncs run config/paper.yaml --clock realtime --processes --duration 10
+    """
+    from agv_analysis.scenario import load_scenario
+
+    shorthands = {"plant.clock": clock, "plant.duration": duration, "relay.seed": seed}
+    given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
+    scenario = load_scenario(params, (*settings, *given))
+    try:
+        from agv_analysis import runner
+    except ImportError as error:
+        raise click.ClickException(
+            f"the loop runs on ROS 2, which is not to be found here ({error}): source your ROS 2 installation, "
+            "or `pip install 'agv_ncs[ros]'`"
+        ) from None
+    from agv_analysis.progress import step_bar
+
+    with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
+        if processes:
+            outcome = runner.run_in_processes(scenario, bag, progress)
+        else:
+            outcome = runner.run_in_process(scenario, bag, progress)
+    rate = f", {outcome.steps / outcome.seconds:.0f} steps/s" if outcome.seconds else ""
+    click.echo(f"{outcome.steps} steps in {outcome.seconds:.1f} s{rate}")
+    if bag is not None:
+        click.echo(f"bag: {bag}: {outcome.recording}")
+    if outcome.failure:
+        raise click.ClickException(outcome.failure)
+    if not outcome.complete:
+        raise click.ClickException("the recording is not complete")
