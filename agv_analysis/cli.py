@@ -15,7 +15,7 @@ COMMANDS = ("run", "analyse")
 
 
 class _Group(click.Group):
-    """Finds commands by name; prints what is wrong with a request in one line, without a traceback, and exits with 1."""
+    """Finds commands by name; what is wrong with a request is one line and exit status 1, never a traceback."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -38,7 +38,7 @@ class _Group(click.Group):
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
 @click.version_option(package_name="agv_ncs")
 def main() -> None:
-    r"""Close an AGV's control loop over a lossy radio link, record it, and learn whether it is stable.
+    """Close an AGV's control loop over a lossy radio link, record it, and learn whether it is stable.
 
     \b
     Examples:

@@ -17,7 +17,7 @@ from agv_analysis.commands import write_json
 )
 @click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
 def command(bag: Path, json_file: Path | None, config: Path | None, picture: Path | None) -> None:
-    r"""Say from the recording BAG whether the loop is stable, and why.
+    """Say from the recording BAG whether the loop is stable, and why.
 
     \b
     Examples:

@@ -25,7 +25,7 @@ def command(
     duration: float | None,
     seed: int | None,
 ) -> None:
-    r"""Run the loop of the params file PARAMS on DDS.
+    """Run the loop of the params file PARAMS on DDS.
 
     \b
     Examples:
