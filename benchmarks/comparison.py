@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Comparison(NamedTuple):
-    """Two speeds in the same unit, the larger the better; a module of this folder gives a list of them by `measure()`."""
+    """Two speeds in one unit, the larger the better; each module of this folder gives a list of them by `measure()`."""
 
     what: str
     ours: float
