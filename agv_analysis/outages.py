@@ -1,0 +1,135 @@
+"""What the radio channel did to a run: losses, outages, age of information."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.run import Run
+from agv_ros.errors import UserError
+
+Steps = NDArray[np.int64]
+Verdicts = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Age:
+    """Age of information over a run, in steps: how old the freshest message is that the receiver holds."""
+
+    mean: float
+    p50: int
+    p99: int
+    max: int
+    ts: float
+    """Sampling period T_s [s]."""
+
+    @property
+    def seconds(self) -> tuple[float, float, float, float]:
+        """Mean, p50, p99 and maximum [s]."""
+        return self.mean * self.ts, self.p50 * self.ts, self.p99 * self.ts, self.max * self.ts
+
+
+@dataclass(frozen=True)
+class LinkOutages:
+    """Outages of one direction of the link; an outage is a series of consecutive lost slots."""
+
+    slots: int
+    lost: int
+    histogram: dict[int, int]
+    """Number of outages by their length in slots, ascending, one still open at the end counted with what was seen."""
+    open_slots: int
+    """Length of the outage that was still open when the run ended, 0 if there was none."""
+    age: Age
+    """Steps since the freshest message that the receiver holds was sent: 0 at a reception."""
+
+    @property
+    def loss_rate(self) -> float:
+        """Share of slots that were lost."""
+        return self.lost / self.slots
+
+    @property
+    def count(self) -> int:
+        """Number of outages."""
+        return sum(self.histogram.values())
+
+    @property
+    def longest(self) -> int:
+        """Slots of the longest outage, 0 if there was none."""
+        return max(self.histogram, default=0)
+
+    @property
+    def mean_burst(self) -> float:
+        """Mean length of an outage in slots, 0 if there was none."""
+        return self.lost / self.count if self.count else 0.0
+
+
+@dataclass(frozen=True)
+class Outages:
+    """Outages of both directions."""
+
+    uplink: LinkOutages
+    """The poses on their way to the edge; its age is n_ul."""
+    downlink: LinkOutages
+    """The commands on their way to the AGV."""
+
+    @property
+    def loss_rate(self) -> float:
+        """Share of uplink slots that were lost."""
+        return self.uplink.loss_rate
+
+    @property
+    def n_ul_max(self) -> int:
+        """Largest number of steps since the freshest pose that the edge held."""
+        return self.uplink.age.max
+
+
+def outages(run: Run) -> Outages:
+    """Outages of a run. Raises UserError if the run has no step.
+
+    The age of the uplink is the recorded n_ul, that of the downlink follows from its verdicts. Where steps are missing
+    from a recording an outage ends: nobody knows what became of those slots.
+    """
+    if not len(run):
+        raise UserError(f"{run.source}: no step of the loop in it, so no outage: record at least one")
+    return Outages(
+        uplink=_link(run.k, run.lost, run.n_ul, run.ts),
+        downlink=_link(run.k, run.downlink_lost, ages(run.k, run.downlink_lost), run.ts),
+    )
+
+
+def _link(k: Steps, lost: Verdicts, age: Steps, ts: float) -> LinkOutages:
+    lengths = outage_lengths(k, lost)
+    values, counts = np.unique(lengths, return_counts=True)
+    return LinkOutages(
+        slots=len(lost),
+        lost=int(np.count_nonzero(lost)),
+        histogram=dict(zip(values.tolist(), counts.tolist(), strict=True)),
+        open_slots=int(lengths[-1]) if lost[-1] else 0,
+        age=age_statistics(age, ts),
+    )
+
+
+def age_statistics(age: Steps, ts: float) -> Age:
+    """Statistics of ages in steps, shape (N,), N >= 1; percentiles are values that occurred."""
+    p50, p99 = np.percentile(age, [50.0, 99.0], method="inverted_cdf")
+    return Age(float(np.mean(age)), int(p50), int(p99), int(np.max(age)), ts)
+
+
+def outage_lengths(k: Steps, lost: Verdicts) -> Steps:
+    """Length of each series of consecutive lost slots, in the order of time; `k` and `lost` have shape (N,)."""
+    begins = np.flatnonzero(lost & ~_follows_lost(k, lost))
+    ends = np.flatnonzero(lost & ~_follows_lost(-k[::-1], lost[::-1])[::-1])
+    return np.asarray(ends - begins + 1, dtype=np.int64)
+
+
+def _follows_lost(k: Steps, lost: Verdicts) -> Verdicts:
+    """Is the slot before each one known, and lost?"""
+    return np.concatenate(([False], lost[:-1] & (np.diff(k) == 1)))
+
+
+def ages(k: Steps, lost: Verdicts) -> Steps:
+    """Steps since the last slot that was not lost, shape (N,); before the first such one, since the beginning."""
+    received = np.where(lost, k[0] if len(k) else 0, k)
+    return np.asarray(k - np.maximum.accumulate(received), dtype=np.int64)
