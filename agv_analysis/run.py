@@ -46,7 +46,7 @@ class Run:
     @property
     def time(self) -> Floats:
         """Time since step 0 [s], shape (N,)."""
-        return self.k * self.ts
+        return np.asarray(self.k * self.ts, dtype=np.float64)
 
     def __len__(self) -> int:
         return len(self.k)

@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import rclpy
 import rclpy.logging
+from rclpy.executors import Executor
 from rclpy.signals import SignalHandlerOptions
 
+from agv_analysis.parameters import RecorderParameters
 from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode, progress_of
 from agv_plant.relay_node import RelayNode
-from agv_ros.executor import EXECUTORS, FLUSH_TIMEOUT, Stop, spin, spin_for, stop_on_signals
+from agv_ros.executor import EXECUTORS, FLUSH_TIMEOUT, SETTLE_TIMEOUT, Stop, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
+from agv_ros.parameters import as_dict
+
+N = TypeVar("N", bound=LoopNode[Any])
 
 NODES: dict[str, Callable[..., LoopNode[Any]]] = {
     "plant": PlantNode,
@@ -45,6 +53,15 @@ _MODULES = {
 _STOP_TIMEOUT = 10.0
 """How long [s] a process that was asked to stop may take; a node needs less than 2 s, a recorder writes its bag."""
 
+_LOOK_PERIOD = 0.1
+"""How often [s] the processes are looked at while they run."""
+
+_STEPS_PER_LOOK = 64
+"""How many steps pass between two calls of `progress`."""
+
+_LOG_PREFIX = re.compile(r"^\[[A-Z]+\] \[[0-9.]+\] \[[^]]*\]: ")
+"""What rclpy's logging puts before a line: severity, time, node."""
+
 Progress = Callable[[int], None]
 """Called with the number of steps done, every now and then."""
 
@@ -59,9 +76,9 @@ class Outcome:
     failure: str
     """Why the run ended early, empty if it did not."""
     recording: str
-    """What the recorder has to say of its completeness, empty without a bag."""
-    complete: bool
-    """Is every message that was published in the bag? True without a bag."""
+    """What the recorder says of the bag, empty without one."""
+    recording_failure: str
+    """Why the bag is not complete, empty if every message that was published is in it."""
 
 
 def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, executor: str = "events") -> Outcome:
@@ -69,17 +86,56 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
 
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
-    scenario = _connected(scenario, recorded=bag is not None)
-    with stop_on_signals() as stop:
+    connected = _connected(scenario, recorded=bag is not None)
+    with stop_on_signals() as stop, _params_file(scenario) as params, ExitStack() as stack:
         context = rclpy.Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        nodes: list[LoopNode[Any]] = []
-        try:
-            return _run_nodes(scenario, bag, progress, executor, stop, context, nodes)
-        finally:
-            for node in nodes:
-                node.destroy_node()
-            context.try_shutdown()
+        stack.callback(context.try_shutdown)
+
+        def add(make: Callable[..., N], settings: object) -> N:
+            node = make(parameter_overrides=overrides(settings), context=context, use_global_arguments=False)
+            stack.callback(node.destroy_node)
+            return node
+
+        plant = add(PlantNode, connected.plant)
+        rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # `progress` says it already
+        loop = [plant, *(add(NODES[name], getattr(connected, name)) for name in SCHEMAS if name != "plant")]
+        recorder = None if bag is None else add(RecorderNode, _recording(scenario, bag, params))
+        return _run_nodes(EXECUTORS[executor](context=context), plant, loop, recorder, stop, progress)
+
+
+def _run_nodes(
+    executor: Executor,
+    plant: PlantNode,
+    loop: Sequence[LoopNode[Any]],
+    recorder: RecorderNode | None,
+    stop: Stop,
+    progress: Progress,
+) -> Outcome:
+    for node in loop if recorder is None else (*loop, recorder):
+        executor.add_node(node)
+    begun = _Stopwatch()
+
+    def is_done() -> bool:
+        if plant.k % _STEPS_PER_LOOK == 1:
+            begun.start()
+            progress(plant.k)
+        return plant.finished or stop.requested
+
+    spin(executor, is_done)
+    seconds = begun.seconds()
+    progress(plant.k)
+    for node in loop:
+        node.close()
+        node.flush(FLUSH_TIMEOUT)
+    if recorder is not None:
+        spin_for(executor, recorder.is_settled, SETTLE_TIMEOUT)
+        recorder.close()
+    executor.shutdown()
+    failure = plant.failure or (f"interrupted at step {plant.k}" if stop.requested else "")
+    return Outcome(
+        plant.k, seconds, failure, recorder.summary if recorder else "", recorder.failure if recorder else ""
+    )
 
 
 def _connected(scenario: Scenario, recorded: bool) -> Scenario:
@@ -90,48 +146,18 @@ def _connected(scenario: Scenario, recorded: bool) -> Scenario:
     })  # fmt: skip
 
 
-def _run_nodes(
-    scenario: Scenario,
-    bag: Path | None,
-    progress: Progress,
-    executor_name: str,
-    stop: Stop,
-    context: rclpy.Context,
-    nodes: list[LoopNode[Any]],
-) -> Outcome:
-    options: dict[str, Any] = {"context": context, "use_global_arguments": False}
-    plant = PlantNode(parameter_overrides=overrides(scenario.plant), **options)
-    nodes.append(plant)
-    rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # `progress` says it already
-    for name in ("relay", "error_detector", "controller"):
-        nodes.append(NODES[name](parameter_overrides=overrides(getattr(scenario, name)), **options))
-    recorder = RecorderNode(bag=bag, scenario=scenario, **options) if bag is not None else None
-    if recorder is not None:
-        nodes.append(recorder)
-    executor = EXECUTORS[executor_name](context=context)
-    for node in nodes:
-        executor.add_node(node)
-    begun = _Stopwatch()
+def _recording(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
+    log_time = "stamp" if scenario.plant.clock == "lockstep" else "receive"
+    return RecorderParameters(bag=str(bag), params_file=str(params), log_time=log_time)
 
-    def is_done() -> bool:
-        if plant.k % 64 == 1:
-            begun.start()
-            progress(plant.k)
-        return plant.finished or stop.requested
 
-    spin(executor, is_done)
-    seconds = begun.seconds()
-    progress(plant.k)
-    failure = plant.failure or (f"interrupted at step {plant.k}" if stop.requested else "")
-    for node in nodes:
-        node.flush(FLUSH_TIMEOUT)
-    recording, complete = "", True
-    if recorder is not None:
-        sent = {output.topic: output.count for node in nodes for output in node.outputs}
-        spin_for(executor, lambda: recorder.has(sent), 2.0)
-        recording, complete = recorder.finish(sent)
-    executor.shutdown()
-    return Outcome(plant.k, seconds, failure, recording, complete)
+@contextmanager
+def _params_file(scenario: Scenario) -> Iterator[Path]:
+    """A file with the scenario's parameters, for as long as it is needed."""
+    with tempfile.TemporaryDirectory(prefix="agv_ncs_") as folder:
+        path = Path(folder) / "params.yaml"
+        path.write_text(scenario.to_yaml(), encoding="utf-8")
+        yield path
 
 
 class _Stopwatch:
@@ -153,15 +179,14 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
 
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
-    with stop_on_signals() as stop, tempfile.TemporaryDirectory(prefix="agv_ncs_") as folder:
-        params = Path(folder) / "params.yaml"
-        params.write_text(_connected(scenario, recorded=bag is not None).to_yaml(), encoding="utf-8")
+    connected = _connected(scenario, recorded=bag is not None)
+    with stop_on_signals() as stop, _params_file(scenario) as params, _params_file(connected) as connected_params:
         nodes: dict[str, _Process] = {}
         try:
             if bag is not None:
-                nodes["recorder"] = _Process("recorder", params, {"bag": str(bag), "params_file": str(params)})
-            for name in ("controller", "error_detector", "relay", "plant"):
-                nodes[name] = _Process(name, params, {})
+                nodes["recorder"] = _Process("recorder", params, as_dict(_recording(scenario, bag, params)))
+            for name in reversed(SCHEMAS):
+                nodes[name] = _Process(name, connected_params, {})
             return _watch(nodes, stop, progress)
         finally:
             for node in nodes.values():
@@ -171,41 +196,40 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
 def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcome:
     """Wait for the plant to end, then stop the others, the recorder last."""
     plant, begun = nodes["plant"], _Stopwatch()
-    while plant.is_running(0.1) and all(node.is_running(0.0) for node in nodes.values()) and not stop.requested:
+    while plant.is_running(_LOOK_PERIOD) and all(node.is_running() for node in nodes.values()) and not stop.requested:
         if plant.steps:
             begun.start()
             progress(plant.steps)
     seconds = begun.seconds()
-    ended = [node for node in nodes.values() if not node.is_running(0.0) and node is not plant]
-    recorder = nodes.get("recorder")
+    ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
+    recorder = nodes.pop("recorder", None)
     for node in nodes.values():
-        if node is not recorder:
-            node.stop(signal.SIGINT)
+        node.stop(signal.SIGINT)
     if recorder is not None:
         recorder.stop(signal.SIGINT)
+        nodes["recorder"] = recorder
     progress(plant.steps)
-    failure = ""
     if stop.requested:
         failure = f"interrupted after step {plant.steps}"
     elif ended:
         failure = f"{ended[0].name} ended: {ended[0].last_words()}"
-    elif plant.status:
-        failure = plant.last_words()
-    if recorder is None:
-        return Outcome(plant.steps, seconds, failure, "", True)
-    return Outcome(plant.steps, seconds, failure, recorder.last_words(), recorder.status == 0)
+    else:
+        failure = plant.last_words() if plant.status else ""
+    recording = recorder.last_words() if recorder else ""
+    failed = recorder is not None and recorder.status != 0
+    return Outcome(plant.steps, seconds, failure, "" if failed else recording, recording if failed else "")
 
 
 class _Process:
     """One node in a process of its own, with what it says."""
 
-    def __init__(self, name: str, params: Path, settings: dict[str, str]) -> None:
+    def __init__(self, name: str, params: Path, settings: dict[str, Any]) -> None:
         self.name = name
         self.steps = 0
         self._lines: list[str] = []
         command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
         for parameter, value in settings.items():
-            command += ["-p", f"{parameter}:={value}"]
+            command += ["-p", f"{parameter}:={json.dumps(value)}"]
         # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order.
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
@@ -217,9 +241,10 @@ class _Process:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            steps = progress_of(line.strip())
+            text = _LOG_PREFIX.sub("", line.strip())
+            steps = progress_of(text)
             if steps is None:
-                self._lines.append(line.strip())
+                self._lines.append(text)
             else:
                 self.steps = steps
 
@@ -228,7 +253,7 @@ class _Process:
         """Exit status, None while it runs."""
         return self._process.poll()
 
-    def is_running(self, wait: float) -> bool:
+    def is_running(self, wait: float = 0.0) -> bool:
         """Does it still run after `wait` [s]?"""
         try:
             self._process.wait(wait)
@@ -242,7 +267,7 @@ class _Process:
 
     def stop(self, number: signal.Signals) -> None:
         """End it, if need be by force, and collect the rest of what it said."""
-        if self.is_running(0.0):
+        if self.is_running():
             self._process.send_signal(number)
             if self.is_running(_STOP_TIMEOUT):
                 self._process.kill()

@@ -25,9 +25,9 @@ class ControllerNode(LoopNode[ControllerParameters]):
 
     def _on_error(self, data: bytes) -> None:
         error, gains = decode_error(data), self.settings
+        self.report_every_second(error.stamp_ns)
         v, w = control_law(error.x_e, error.y_e, error.theta_e, error.v_r, error.w_r, gains.kx, gains.ky, gains.ktheta)
         self._cmd_vel.publish(encode_command(Command(error.stamp_ns, limit_speed(v, gains.v_max), w)))
-        self.report_every_second(error.stamp_ns)
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -43,8 +43,8 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
     def _on_slot(self, data: bytes) -> None:
         slot = decode_slot(data)
         self._steps.of(slot.stamp_ns)
-        self._answer(self._join.add_slot(slot))
         self.report_every_second(slot.stamp_ns)
+        self._answer(self._join.add_slot(slot))
 
     def _answer(self, ready: list[Joined[Pose]]) -> None:
         for joined in ready:

@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from rclpy.clock import Clock as RosClock
-from rclpy.clock import ClockType
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
@@ -69,7 +67,6 @@ class PlantNode(LoopNode[PlantParameters]):
         self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
         self._held = HeldCommand(to_nanoseconds(settings.cmd_vel_timeout))
         self.punctuality = Punctuality(self.grid.ts_ns)
-        self._steady = RosClock(clock_type=ClockType.STEADY_TIME)
         self._lockstep = settings.clock == "lockstep"
         self._pose_out = self.output(PoseStamped, "agv/pose")
         self._clock_out = self.output(Clock, "/clock", side=True)

@@ -12,7 +12,7 @@ from agv_plant.parameters import RelayParameters
 from agv_plant.radio import Channel, Link
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode, Output
-from agv_ros.wire import DELIVERED, encode_slot, stamp_of
+from agv_ros.wire import DELIVERED, Slot, encode_slot, stamp_of
 
 
 class RelayNode(LoopNode[RelayParameters]):
@@ -31,22 +31,23 @@ class RelayNode(LoopNode[RelayParameters]):
         self.input(TwistStamped, "edge/cmd_vel", self._on_command, self._agv_cmd_vel, self._agv_slot)
 
     def _on_pose(self, data: bytes) -> None:
-        self._relay(data, self.uplink, self._edge_pose, self._edge_slot)
-        self.report_every_second(stamp_of(data))
+        slot = self.uplink.transmit(stamp_of(data))
+        self.report_every_second(slot.stamp_ns)
+        _pass_on(data, slot, self._edge_pose, self._edge_slot)
 
     def _on_command(self, data: bytes) -> None:
-        self._relay(data, self.downlink, self._agv_cmd_vel, self._agv_slot)
-
-    def _relay(self, data: bytes, link: Link, forward: Output, verdict: Output) -> None:
-        slot = link.transmit(stamp_of(data))
-        if slot.verdict == DELIVERED:
-            forward.publish(data)
-        verdict.publish(encode_slot(slot))
+        _pass_on(data, self.downlink.transmit(stamp_of(data)), self._agv_cmd_vel, self._agv_slot)
 
     def on_settings(self) -> None:
         """Changed loss parameters hold from the next slot on."""
         self.uplink.channel.parameters = self.settings.uplink
         self.downlink.channel.parameters = self.settings.downlink
+
+
+def _pass_on(data: bytes, slot: Slot, forward: Output, verdict: Output) -> None:
+    if slot.verdict == DELIVERED:
+        forward.publish(data)
+    verdict.publish(encode_slot(slot))
 
 
 def main(args: Sequence[str] | None = None) -> None:

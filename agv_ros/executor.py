@@ -26,6 +26,9 @@ EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "sing
 SPIN_TIMEOUT = 0.05
 """Longest wait [s] for the next event. Unbounded, the events executor neither runs timers nor sees signals."""
 
+SETTLE_TIMEOUT = 1.0
+"""How long [s] a node that is told to stop waits for messages that are on their way to it."""
+
 FLUSH_TIMEOUT = 0.5
 """How long [s] a node that ends waits for a subscriber that still has not got everything."""
 
@@ -93,6 +96,7 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     executor = EventsExecutor()
     executor.add_node(node)
     spin(executor, lambda: node.finished or stop.requested)
+    spin_for(executor, node.is_settled, SETTLE_TIMEOUT)
     node.close()
     node.flush(FLUSH_TIMEOUT)
     executor.shutdown()

@@ -8,8 +8,9 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import (
     InvalidParameterTypeException,
@@ -21,11 +22,10 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.time import Time
 
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid, to_nanoseconds
-from agv_ros.wire import InvalidMessageError, stamp_of
+from agv_ros.wire import InvalidMessageError, encode_diagnostics, stamp_of
 
 P = TypeVar("P", bound=LoopParameters)
 
@@ -34,6 +34,13 @@ LOOP_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
+
+
+PUBLISHED = "published "
+"""Key, before the topic's name, under which a node's diagnostics say how many messages it has published there."""
+
+ENDED = "ended"
+"""Key in a node's last diagnostics: what it says there of its messages is final."""
 
 
 class Output:
@@ -74,10 +81,11 @@ class LoopNode(Node, Generic[P]):
         self.finished = False
         self.failure = ""
         self.outputs: list[Output] = []
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._steps_per_report = max(1, round(1.0 / self.settings.ts))
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", LOOP_QOS)
-        self.diagnostics_output = Output(self._diagnostics, side=True)
-        self.outputs.append(self.diagnostics_output)
+        self._last_ns = self.grid.start_ns
+        self._ended = False
+        self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
     # -- topics ------------------------------------------------------------------------------------------------------
@@ -119,14 +127,26 @@ class LoopNode(Node, Generic[P]):
         if attempt():
             return
 
+        succeeded = False
+
         def again() -> None:
-            if attempt():
+            # A timer that was destroyed can have one more event on its way, in the events executor.
+            nonlocal succeeded
+            if not succeeded and attempt():
+                succeeded = True
                 self.destroy_timer(timer)
 
-        timer = self.create_timer(_POLL_PERIOD, again)
+        # On the steady clock: where use_sim_time is set, ROS time stands still until the loop runs.
+        timer = self.create_timer(_POLL_PERIOD, again, clock=self._steady)
+
+    def is_settled(self) -> bool:
+        """Has everything that is still on its way to this node arrived? Asked for a moment when it is told to stop."""
+        return True
 
     def close(self) -> None:
-        """Called once, after the last callback: bring to an end what the node holds open."""
+        """Called once, after the last callback: say for the last time what was published."""
+        self._ended = True
+        self.report(self._last_ns)
 
     def flush(self, seconds: float) -> None:
         """Wait until all that was published has arrived, `seconds` per output at most."""
@@ -159,24 +179,26 @@ class LoopNode(Node, Generic[P]):
         return {}
 
     def report_every_second(self, stamp_ns: int) -> None:
-        """Publish diagnostics once per second of the loop's time, at whole seconds after step 0."""
+        """Publish diagnostics once per second of the loop's time, at whole seconds after step 0.
+
+        Called before a step's answer is published, so that no other node's report of the step can come before it.
+        """
+        self._last_ns = max(self._last_ns, stamp_ns)
         if self.grid.step(stamp_ns) % self._steps_per_report == 0:
             self.report(stamp_ns)
 
     def report(self, stamp_ns: int) -> None:
         """Publish this node's diagnostics now."""
         total = sum(self.rejected.values())
-        facts = self.facts() | {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
-        status = DiagnosticStatus(
-            level=DiagnosticStatus.WARN if total else DiagnosticStatus.OK,
-            name=self.get_fully_qualified_name().lstrip("/"),
-            message=f"{total} messages rejected" if total else "ok",
-            values=[KeyValue(key=key, value=value) for key, value in facts.items()],
-        )
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = Time(nanoseconds=max(0, stamp_ns)).to_msg()
-        self.diagnostics_output.count += 1
-        self._diagnostics.publish(message)
+        published = {output.topic: output.count for output in self.outputs}
+        published[self._diagnostics.topic] += 1  # this report
+        facts = self.facts() | {f"{PUBLISHED}{topic}": str(count) for topic, count in published.items()}
+        facts |= {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
+        if self._ended:
+            facts |= {ENDED: "true"}
+        message = f"{total} messages rejected" if total else "ok"
+        name = self.get_fully_qualified_name().lstrip("/")
+        self._diagnostics.publish(encode_diagnostics(max(0, stamp_ns), int(total > 0), name, message, facts))
 
     # -- parameters --------------------------------------------------------------------------------------------------
 

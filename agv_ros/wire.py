@@ -3,8 +3,8 @@
 rclpy takes and publishes serialised messages as they are (`raw=True`). Building a message object, converting it to C
 and serialising it costs five times as much as packing its few numbers directly, and a control loop consists of little
 else. So the loop's nodes speak CDR themselves, for exactly four types: geometry_msgs/PoseStamped,
-geometry_msgs/TwistStamped, nav_msgs/Odometry and sensor_msgs/TimeReference. Every other message of this project goes
-through rclpy as usual.
+geometry_msgs/TwistStamped, nav_msgs/Odometry and sensor_msgs/TimeReference; and they write diagnostics and the clock,
+since rclpy leaves whatever memory held before in the gaps of a message, and equal runs shall have equal bytes.
 
 Theory of operation. A CDR stream is a 4-byte encapsulation header (byte 1: 1 little, 0 big endian) and the members in
 order, each aligned to its own size counted from the end of that header. Up to the last string the layout of a type is
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -149,6 +150,14 @@ def stamp_of(data: bytes) -> int:
 _LITTLE = b"\x00\x01\x00\x00"
 
 
+def padded(data: bytes) -> bytes:
+    """Message filled up to whole 4-byte words, as RTPS does on its way between processes but not within one.
+
+    So a message has the same bytes wherever its reader is.
+    """
+    return data + bytes(-len(data) % 4)
+
+
 def encode_clock(stamp_ns: int) -> bytes:
     """rosgraph_msgs/Clock."""
     return _LITTLE + struct.pack("<iI", *_split(stamp_ns))
@@ -217,7 +226,9 @@ def encode_slot(slot: Slot) -> bytes:
     """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = verdict."""
     source = slot.verdict.encode() + b"\0"
     layout = _layout("<", "iI", (1,), f"iII{len(source)}s", 4)
-    return _LITTLE + layout.pack(*_split(slot.stamp_ns), 1, b"\0", *_split(slot.freshest_ns), len(source), source)
+    return padded(
+        _LITTLE + layout.pack(*_split(slot.stamp_ns), 1, b"\0", *_split(slot.freshest_ns), len(source), source)
+    )
 
 
 def decode_slot(data: bytes) -> Slot:
@@ -229,3 +240,17 @@ def decode_slot(data: bytes) -> Slot:
     text = bytes(values[-1])  # type: ignore[call-overload]
     freshest = int(values[4]) * NS_PER_S + int(values[5])
     return Slot(int(values[0]) * NS_PER_S + int(values[1]), freshest, text.rstrip(b"\0").decode("utf-8", "replace"))
+
+
+def _aligned_string(text: str) -> bytes:
+    """A string that begins and ends on a whole word."""
+    content = text.encode() + b"\0"
+    return padded(struct.pack("<I", len(content)) + content)
+
+
+def encode_diagnostics(stamp_ns: int, level: int, name: str, message: str, facts: Mapping[str, str]) -> bytes:
+    """diagnostic_msgs/DiagnosticArray with one status; `level` is 0 (OK), 1 (WARN) or 2 (ERROR)."""
+    head = struct.pack("<iI", *_split(stamp_ns)) + _aligned_string("") + struct.pack("<IBxxx", 1, level)
+    status = _aligned_string(name) + _aligned_string(message) + _aligned_string("")
+    values = b"".join(_aligned_string(key) + _aligned_string(value) for key, value in facts.items())
+    return _LITTLE + head + status + struct.pack("<I", len(facts)) + values

@@ -54,9 +54,8 @@ def command(
             outcome = runner.run_in_process(scenario, bag, progress)
     rate = f", {outcome.steps / outcome.seconds:.0f} steps/s" if outcome.seconds else ""
     click.echo(f"{outcome.steps} steps in {outcome.seconds:.1f} s{rate}")
-    if bag is not None:
+    if outcome.recording:
         click.echo(f"bag: {bag}: {outcome.recording}")
-    if outcome.failure:
-        raise click.ClickException(outcome.failure)
-    if not outcome.complete:
-        raise click.ClickException("the recording is not complete")
+    failures = [failure for failure in (outcome.failure, outcome.recording_failure) if failure]
+    if failures:
+        raise click.ClickException("; ".join(failures))

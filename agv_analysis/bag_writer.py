@@ -1,0 +1,149 @@
+"""Writing a rosbag2 directory: metadata.yaml and one MCAP file, as `ros2 bag` knows them, from serialised messages.
+
+Messages are put in the order (log time, topic, payload) before they are written, within a window that is far longer
+than the loop needs to carry a step around. In lockstep, where log times are stamps, two equal runs thus give equal
+files, whatever way the messages of a step overtook each other on their way to the recorder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from mcap.writer import CompressionType, Writer
+
+from agv_ros.errors import UserError
+
+METADATA_NAME = "agv_ncs"
+"""Name of the MCAP metadata record that holds the run's version, seed and parameters."""
+
+_WINDOW = 1024
+"""Messages that are held back to be ordered."""
+
+_BATCH = 8192
+"""Messages that are ordered and written at a time."""
+
+_VERSION = 9  # of the metadata of rosbag2 in Jazzy
+
+
+class TopicInfo(NamedTuple):
+    """What a bag says of a topic: name, type, definition, hash of the type (RIHS01), QoS that its publishers offer."""
+
+    name: str
+    type: str
+    schema: str
+    type_hash: str
+    offered_qos: Sequence[dict[str, Any]]
+
+
+class BagWriter:
+    """An open bag. `describe` is asked for a topic, by its number, when the first messages are written."""
+
+    def __init__(self, directory: Path, describe: Sequence[Callable[[], TopicInfo]], about: dict[str, str]) -> None:
+        """Create the directory. Raises UserError if it exists or cannot be made."""
+        self._directory = directory
+        self._file_name = f"{directory.name}_0.mcap"
+        self._describe = describe
+        self._topics: list[TopicInfo] = []
+        self._pending: list[tuple[int, int, bytes, int]] = []
+        self.counts = [0] * len(describe)
+        self._first_ns, self._last_ns = 0, 0
+        try:
+            directory.mkdir(parents=True)
+            self._file = (directory / self._file_name).open("xb")
+        except FileExistsError:
+            raise UserError(f"{directory}: exists already; name a new directory or remove it first") from None
+        except OSError as error:
+            raise UserError(f"{directory}: cannot be recorded to: {error.strerror}") from None
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True)
+        self._writer.start(profile="ros2", library=f"agv_ncs {about.get('version', '')}".strip())
+        self._writer.add_metadata(METADATA_NAME, about)
+
+    def write(self, topic: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        """Add a message to the topic with this number."""
+        self._pending.append((log_time_ns, topic, data, publish_time_ns))
+        self.counts[topic] += 1
+        if len(self._pending) >= _BATCH:
+            self._write_all_but(_WINDOW)
+
+    def close(self) -> None:
+        """Write what is held back, the index and metadata.yaml."""
+        self._write_all_but(0)
+        metadata = self._metadata()
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": _dump(metadata)})
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+        text = _dump({"rosbag2_bagfile_information": metadata})
+        (self._directory / "metadata.yaml").write_text(text, encoding="utf-8")
+
+    def _write_all_but(self, newest: int) -> None:
+        if not self._topics:
+            self._register()
+        self._pending.sort()
+        count = len(self._pending) - newest
+        for log_time_ns, topic, data, publish_time_ns in self._pending[:count]:
+            self._writer.add_message(topic + 1, log_time_ns, data, publish_time_ns)
+        if count > 0:
+            self._first_ns = self._first_ns or self._pending[0][0]
+            self._last_ns = max(self._last_ns, self._pending[count - 1][0])
+            del self._pending[:count]
+
+    def _register(self) -> None:
+        schemas: dict[str, int] = {}
+        for describe in self._describe:
+            topic = describe()
+            self._topics.append(topic)
+            if topic.type not in schemas:
+                schemas[topic.type] = self._writer.register_schema(topic.type, "ros2msg", topic.schema.encode())
+            about = {"offered_qos_profiles": _dump(topic.offered_qos), "topic_type_hash": topic.type_hash}
+            self._writer.register_channel(topic.name, "cdr", schemas[topic.type], about)
+
+    def _metadata(self) -> dict[str, Any]:
+        start = {"nanoseconds_since_epoch": self._first_ns}
+        duration = {"nanoseconds": self._last_ns - self._first_ns}
+        file = {
+            "path": self._file_name,
+            "starting_time": start,
+            "duration": duration,
+            "message_count": sum(self.counts),
+        }
+        return {
+            "version": _VERSION,
+            "storage_identifier": "mcap",
+            "duration": duration,
+            "starting_time": start,
+            "message_count": sum(self.counts),
+            "topics_with_message_count": [
+                {"topic_metadata": _topic_metadata(topic), "message_count": count}
+                for topic, count in zip(self._topics, self.counts, strict=True)
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [self._file_name],
+            "files": [file],
+            "custom_data": None,
+            "ros_distro": "jazzy",
+        }
+
+
+def _topic_metadata(topic: TopicInfo) -> dict[str, Any]:
+    return {
+        "name": topic.name,
+        "type": topic.type,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": list(topic.offered_qos),
+        "type_description_hash": topic.type_hash,
+    }
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes every value out: rosbag2's reader is not asked to know YAML's anchors."""
+
+    def ignore_aliases(self, _: Any) -> bool:
+        return True
+
+
+def _dump(content: Any) -> str:
+    return yaml.dump(content, Dumper=_Dumper, sort_keys=False)

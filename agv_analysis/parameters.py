@@ -1,0 +1,20 @@
+"""Parameters of the recorder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from agv_ros.parameters import LoopParameters, parameter
+
+
+@dataclass(frozen=True)
+class RecorderParameters(LoopParameters):
+    """Parameters of the node `recorder`."""
+
+    bag: str = parameter("bag", "directory to record to, which must not exist")
+    params_file: str = parameter("", "the run's params file, to be embedded in the bag")
+    log_time: str = parameter(
+        "stamp",
+        "log time of a message; stamp: its own, so that equal runs give equal files; receive: when it was received",
+        choices=("stamp", "receive"),
+    )

@@ -1,0 +1,171 @@
+"""The recorder: every message of the loop into a rosbag2 directory, as it came over the wire."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.duration import Duration, Infinite
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import TimeReference
+
+from agv_analysis.bag_writer import BagWriter, TopicInfo
+from agv_analysis.message_schema import schema_of
+from agv_analysis.parameters import RecorderParameters
+from agv_analysis.scenario import load_scenario
+from agv_ros.executor import run_node
+from agv_ros.node import ENDED, PUBLISHED, LoopNode
+from agv_ros.wire import stamp_of
+
+TOPICS: dict[str, type] = {
+    "/clock": Clock,
+    "agv/pose": PoseStamped,
+    "edge/pose": PoseStamped,
+    "edge/slot": TimeReference,
+    "edge/error": Odometry,
+    "edge/cmd_vel": TwistStamped,
+    "agv/cmd_vel": TwistStamped,
+    "agv/slot": TimeReference,
+    "/diagnostics": DiagnosticArray,
+}
+"""What is recorded. The loop's names are relative: a recorder records the loop of its own namespace."""
+
+
+class RecorderNode(LoopNode[RecorderParameters]):
+    """Writes raw messages and holds the count against what the nodes say that they have published."""
+
+    def __init__(self, **node_options: Any) -> None:
+        super().__init__("recorder", RecorderParameters, **node_options)
+        settings = self.settings
+        self.summary = ""
+        self._published: dict[str, Counter[str]] = {}
+        self._running: set[str] = set()
+        self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
+        describe = [self._describer(topic, kind) for topic, kind in zip(self._names, TOPICS.values(), strict=True)]
+        self._writer = BagWriter(Path(settings.bag), describe, _about(settings.params_file))
+        self._now_ns: Callable[[int], int] = (
+            (lambda stamp_ns: stamp_ns) if settings.log_time == "stamp" else (lambda _: time.time_ns())
+        )
+        for number, (topic, kind) in enumerate(TOPICS.items()):
+            self.input(kind, topic, self._receiver(number))
+
+    def _receiver(self, number: int) -> Callable[[bytes], None]:
+        write, now_ns = self._writer.write, self._now_ns
+
+        def record(data: bytes) -> None:
+            stamp_ns = max(0, stamp_of(data))  # MCAP knows no time before 0
+            write(number, data, now_ns(stamp_ns), stamp_ns)
+
+        def record_diagnostics(data: bytes) -> None:
+            record(data)
+            self._note(deserialize_message(data, DiagnosticArray))
+
+        return record_diagnostics if self._names[number] == "/diagnostics" else record
+
+    def _describer(self, topic: str, kind: type) -> Callable[[], TopicInfo]:
+        module = kind.__module__.split(".")
+        type_name = f"{module[0]}/{module[1]}/{kind.__name__}"
+
+        def describe() -> TopicInfo:
+            publishers = self.get_publishers_info_by_topic(topic)
+            offered = [_qos(info.qos_profile) for info in publishers]
+            distinct = [qos for i, qos in enumerate(offered) if qos not in offered[:i]]
+            type_hash = str(publishers[0].topic_type_hash) if publishers else ""
+            return TopicInfo(topic, type_name, schema_of(type_name), type_hash, distinct)
+
+        return describe
+
+    # -- completeness ------------------------------------------------------------------------------------------------
+
+    def _note(self, diagnostics: DiagnosticArray) -> None:
+        for status in diagnostics.status:
+            facts = {value.key: value.value for value in status.values}
+            counts = {
+                key.removeprefix(PUBLISHED): int(value)
+                for key, value in facts.items()
+                if key.startswith(PUBLISHED) and value.isdecimal()
+            }
+            if counts:
+                self._published[status.name] = Counter(counts)
+                (self._running.discard if ENDED in facts else self._running.add)(status.name)
+
+    def missing(self) -> dict[str, int]:
+        """Messages by topic that nodes say they have published and that are not here."""
+        published = sum(self._published.values(), Counter())
+        recorded = dict(zip(self._names, self._writer.counts, strict=True))
+        return {topic: published[topic] - count for topic, count in recorded.items() if published[topic] > count}
+
+    def is_settled(self) -> bool:
+        """Is everything here that was published? Only nodes that have ended have said all that they published."""
+        return not self._running and not self.missing()
+
+    def close(self) -> None:
+        """Finish the bag and say what is in it."""
+        missing = self.missing()
+        try:
+            self._writer.close()
+        except OSError as error:
+            self.failure = f"{self.settings.bag}: cannot be written: {error.strerror}"
+            return
+        self.summary = f"{sum(self._writer.counts)} messages"
+        if missing:
+            lost = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
+            self.failure = f"{self.settings.bag}: the recording is not complete, missing: {lost}"
+        elif self._running:
+            self.summary += f"; these nodes did not say that they ended: {', '.join(sorted(self._running))}"
+        elif self._published:
+            self.summary += ", everything that was published"
+        else:
+            self.summary += "; no node of the loop said how many it published"
+        self.get_logger().info(f"{self.settings.bag}: {self.summary}")
+
+
+def _about(params_file: str) -> dict[str, str]:
+    """What is embedded in the bag: version, and the run's parameters and seed if they are known. Raises UserError."""
+    try:
+        version = metadata.version("agv_ncs")
+    except metadata.PackageNotFoundError:
+        version = "not installed"
+    if not params_file:
+        return {"version": version}
+    scenario = load_scenario(params_file)
+    return {"version": version, "seed": str(scenario.relay.seed), "params": scenario.to_yaml()}
+
+
+def _qos(profile: QoSProfile) -> dict[str, Any]:
+    """A QoS profile as rosbag2 writes it down."""
+    return {
+        "history": profile.history.short_key,
+        "depth": profile.depth,
+        "reliability": profile.reliability.short_key,
+        "durability": profile.durability.short_key,
+        "deadline": _duration(profile.deadline),
+        "lifespan": _duration(profile.lifespan),
+        "liveliness": profile.liveliness.short_key,
+        "liveliness_lease_duration": _duration(profile.liveliness_lease_duration),
+        "avoid_ros_namespace_conventions": profile.avoid_ros_namespace_conventions,
+    }
+
+
+def _duration(duration: Duration) -> dict[str, int]:
+    # rclpy's Infinite is 2^63 - 1 ns; rosbag2 knows the same instant.
+    sec, nsec = divmod(Infinite.nanoseconds if duration == Infinite else duration.nanoseconds, 1_000_000_000)
+    return {"sec": sec, "nsec": nsec}
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry point of the executable `recorder`."""
+    run_node(RecorderNode, args)
+
+
+if __name__ == "__main__":
+    main()
