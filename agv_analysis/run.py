@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,8 +36,10 @@ class Run:
     """Verdict of the downlink on slot k, shape (N,)."""
     source: str = "simulation"
     """Where the run comes from: the path of its bag, or `simulation`."""
-    notes: tuple[str, ...] = field(default=())
-    """What a reader must know of the recording: missing messages, an interrupted run."""
+    unexplained: Mapping[str, int] = field(default_factory=dict)
+    """Messages by topic that are missing although no channel lost them; with any of them the run proves nothing."""
+    notes: tuple[str, ...] = ()
+    """What a reader must know of the recording: damage, repeated steps, parameters that do not fit."""
 
     @property
     def ts(self) -> float:

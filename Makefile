@@ -1,0 +1,46 @@
+# Everything happens in .venv, which is made when it is first needed. Where a ROS 2 installation is sourced, its rclpy is
+# used; elsewhere rclpy comes from PyPI.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := bags/demo
+
+HAVE_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
+EXTRA_ROS := $(if $(HAVE_ROS),,ros)
+comma := ,
+
+export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
+
+.PHONY: demo test bench sample clean
+
+demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
+	rm -rf $(DEMO)
+	$(BIN)/agv-ncs run config/outages.yaml --bag $(DEMO)
+	$(BIN)/agv-ncs analyse $(DEMO) --json $(DEMO)/analysis.json
+
+test: $(VENV)/test.stamp ## style, types and tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n auto --dist worksteal --cov --cov-report=term $(PYTEST_ARGS)
+
+bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
+	$(BIN)/python -m benchmarks $(BENCH)
+
+sample: $(VENV)/run.stamp ## make the sample bag anew
+	rm -rf bags/sample
+	$(BIN)/agv-ncs run config/outages.yaml --bag bags/sample --duration 10
+
+clean:
+	rm -rf $(VENV) $(DEMO) build install log *.egg-info
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/run.stamp: $(VENV)/bin/python setup.py
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRA_ROS)]'
+	touch $@
+
+$(VENV)/test.stamp: $(VENV)/bin/python setup.py
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test$(if $(EXTRA_ROS),$(comma)ros)]'
+	touch $@ $(VENV)/run.stamp
