@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-COMMANDS = ("run", "analyse")
+COMMANDS = ("run", "analyse", "simulate")
 
 
 class _Group(click.Group):

@@ -22,6 +22,9 @@ TOLERANCE = 0.01
 SHARE = 0.02
 """Relative band of settling: 2 % of the initial error, or of the largest deviation of a command."""
 
+NEGLIGIBLE = 1e-9
+"""An initial error up to this size [m, rad] is rounding, of which no share is taken."""
+
 CRITICAL_TIME = 0.25
 """Longest settling [s] of a critically damped command after its last saturated sample."""
 
@@ -40,7 +43,7 @@ class ErrorMetrics:
     settle_1cm_steps: int | None
     """First step from which on |e| is below 1 cm (0.01 rad); None if that did not happen."""
     settle_2pct_steps: int | None
-    """First step from which on |e| is below 2 % of its initial value; None if that did not happen or it began at 0."""
+    """First step from which on |e| is below 2 % of its initial value; None if that did not happen or e began at 0."""
     overshoot: float | None
     """Largest error on the other side of zero as a share of the initial one; None if that is 0."""
     sign_changes: int
@@ -126,6 +129,7 @@ def wrapped(angle: Floats) -> Floats:
 def error_metrics(k: NDArray[np.int64], e: Floats, ts: float) -> ErrorMetrics:
     """Metrics of an error e(k) at the steps k, shapes (N,), N >= 1, with sampling period `ts` [s]."""
     initial, size = float(e[0]), np.abs(e)
+    started = abs(initial) > NEGLIGIBLE
     with np.errstate(over="ignore"):
         iae, ise = float(np.sum(size) * ts), float(np.sum(e * e) * ts)
     return ErrorMetrics(
@@ -133,8 +137,8 @@ def error_metrics(k: NDArray[np.int64], e: Floats, ts: float) -> ErrorMetrics:
         final=float(e[-1]),
         peak=float(np.max(size)),
         settle_1cm_steps=_settling_step(k, size, TOLERANCE),
-        settle_2pct_steps=_settling_step(k, size, SHARE * abs(initial)),
-        overshoot=_overshoot(e) if initial else None,
+        settle_2pct_steps=_settling_step(k, size, SHARE * abs(initial)) if started else None,
+        overshoot=_overshoot(e) if started else None,
         sign_changes=sign_changes(e, TOLERANCE),
         iae=iae,
         ise=ise,

@@ -1,0 +1,62 @@
+"""`agv-ncs simulate`: the loop without ROS."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from agv_analysis.commands import with_settings, write_json
+
+if TYPE_CHECKING:
+    from agv_analysis.run import Run
+
+
+@click.command("simulate")
+@with_settings
+@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the run to this file, a row a step.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+def command(params: str, settings: tuple[str, ...], csv_file: Path | None, json_file: Path | None) -> None:
+    """Simulate the loop of the params file PARAMS without ROS and say whether it is stable, and why.
+
+    \b
+    Examples:
+      agv-ncs simulate config/paper.yaml
+      agv-ncs simulate config/outages.yaml --set controller.kx=250.0 --set relay.seed=7 --json fast.json
+      agv-ncs simulate config/paper.yaml --set error_detector.track=eight --csv eight.csv
+    """
+    from agv_analysis.analysis import analyse
+    from agv_analysis.scenario import load_scenario
+    from agv_analysis.simulation.single import simulate
+    from agv_analysis.table import print_table
+
+    run = simulate(load_scenario(params, settings))
+    analysis = analyse(run)
+    print_table(analysis)
+    if csv_file is not None:
+        write_csv(csv_file, run)
+        click.echo(f"csv:     {csv_file}")
+    if json_file is not None:
+        write_json(json_file, analysis.to_json())
+
+
+COLUMNS = (
+    "k", "t", "x_c", "y_c", "theta_c", "x_r", "y_r", "theta_r", "v_r", "w_r", "x_e", "y_e", "theta_e", "v", "w", "n_ul",
+    "lost", "downlink_lost",
+)  # fmt: skip
+"""Columns of the CSV file: [s], [m], [rad], [m/s], [rad/s]; x_e .. theta_e as the edge computed them; verdicts 0, 1."""
+
+
+def write_csv(path: Path, run: Run) -> None:
+    """Write a run to a CSV file, a row a step, numbers in full precision; a path that cannot be written is an error."""
+    flags = (run.lost.astype(int), run.downlink_lost.astype(int))
+    arrays = (run.k, run.time, *run.pose.T, *run.reference.T, *run.error.T, *run.command.T, run.n_ul, *flags)
+    try:
+        with open(path, "w", encoding="utf-8", newline="") as file:
+            rows = csv.writer(file)
+            rows.writerow(COLUMNS)
+            rows.writerows(zip(*(array.tolist() for array in arrays), strict=True))
+    except OSError as error:
+        raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None

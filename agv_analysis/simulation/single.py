@@ -1,0 +1,71 @@
+"""One run of a scenario, with its full history."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agv_analysis.run import Run
+from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.compiled import compiled, numbers
+from agv_analysis.simulation.loop import Settings, at_rest, history
+from agv_cloud.reference import Reference
+from agv_plant.radio import losses
+from agv_ros.errors import UserError
+
+
+def simulate(scenario: Scenario) -> Run:
+    """The run of a scenario in lockstep, as a recording of the nodes would give it.
+
+    Raises UserError if the run has no end, TrackFileError for a bad track file. A loop that leaves the range of numbers
+    ends there, and its run says so in its notes.
+    """
+    steps, relay = steps_of(scenario), scenario.relay
+    reference = Reference(scenario.error_detector).first(steps)
+    lost = losses(relay.uplink, relay.seed, "uplink", steps)
+    downlink_lost = losses(relay.downlink, relay.seed, "downlink", steps)
+    rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
+    done = compiled(history)(
+        numbers(reference), numbers(lost), numbers(downlink_lost), at_rest(*scenario.plant.initial_pose),
+        settings_of(scenario), rows, n_ul,
+    )  # fmt: skip
+    return Run(
+        scenario=scenario,
+        k=np.arange(done),
+        pose=rows[:done, 0:3],
+        reference=reference[:done],
+        error=rows[:done, 3:6],
+        command=rows[:done, 6:8],
+        n_ul=n_ul[:done],
+        lost=lost[:done],
+        downlink_lost=downlink_lost[:done],
+        notes=tuple(_notes(scenario, done, steps)),
+    )
+
+
+def steps_of(scenario: Scenario) -> int:
+    """Number of steps of a scenario's run. Raises UserError if it has no end."""
+    plant = scenario.plant
+    if math.isinf(plant.duration):
+        raise UserError(
+            "plant.duration is inf, but a simulation needs an end: set it, as in --set plant.duration=100.0"
+        )
+    return max(1, round(plant.duration / plant.ts))
+
+
+def settings_of(scenario: Scenario) -> Settings:
+    """What a slot of the loop needs to know of a scenario."""
+    gains, plant = scenario.controller, scenario.plant
+    return Settings(gains.kx, gains.ky, gains.ktheta, gains.v_max, plant.ts, plant.integration == "arc")
+
+
+def _notes(scenario: Scenario, done: int, steps: int) -> list[str]:
+    notes = []
+    if done < steps:
+        notes.append(f"the loop diverged: after step {done - 1} of {steps} the AGV left the range of numbers")
+    if scenario.plant.clock != "lockstep":
+        notes.append(
+            f"plant.clock is {scenario.plant.clock}, but a simulation runs in lockstep: no jitter, no time-out"
+        )
+    return notes
