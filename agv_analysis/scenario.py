@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
-
-import yaml
 
 from agv_cloud.parameters import ControllerParameters, ErrorDetectorParameters
 from agv_plant.parameters import PlantParameters, RelayParameters
-from agv_ros.parameters import as_dict
+from agv_ros.parameters import ParameterError, as_dict
 from agv_ros.params_file import parse_sections, read_sections, resolve
+from agv_ros.ros_yaml import dump
 from agv_ros.stamps import Grid
 
 SCHEMAS: dict[str, type] = {
@@ -39,9 +39,7 @@ class Scenario:
 
     def to_yaml(self) -> str:
         """The whole scenario as a ROS 2 params file, with every default written out."""
-        return yaml.safe_dump(
-            {node: {"ros__parameters": _plain(as_dict(getattr(self, node)))} for node in SCHEMAS}, sort_keys=False
-        )
+        return dump({node: {"ros__parameters": _plain(as_dict(getattr(self, node)))} for node in SCHEMAS})
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
@@ -50,14 +48,21 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
 
 def load_scenario(path: str, settings: Iterable[str] = ()) -> Scenario:
     """Scenario from a params file and settings `node.parameter=value`. Raises ParameterError."""
-    return Scenario(**resolve(SCHEMAS, _own(read_sections(path)), settings, path))
+    return Scenario(**resolve(SCHEMAS, _own(read_sections(path), path), settings, path))
 
 
 def parse_scenario(text: str, name: str, settings: Iterable[str] = ()) -> Scenario:
     """As `load_scenario`, from the text of a params file called `name` in messages."""
-    return Scenario(**resolve(SCHEMAS, _own(parse_sections(text, name)), settings, name))
+    return Scenario(**resolve(SCHEMAS, _own(parse_sections(text, name), name), settings, name))
 
 
-def _own(sections: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Only the sections of the loop's nodes: a file may hold those of other nodes (recorder, RViz) as well."""
+def _own(sections: dict[str, dict[str, Any]], path: str) -> dict[str, dict[str, Any]]:
+    """Only the sections of the loop's nodes: a file may hold those of other nodes (recorder, RViz) as well.
+
+    Raises ParameterError for a section that looks like a misspelt one: ROS would ignore it, and its gains with it.
+    """
+    for node in sections:
+        meant = get_close_matches(node, SCHEMAS, 1, cutoff=0.8) if node not in SCHEMAS else []
+        if meant and not node.startswith(meant[0]):  # relay_2 is another node
+            raise ParameterError(f"{path}: no node is called {node!r}: is section {meant[0]!r} meant?")
     return {node: section for node, section in sections.items() if node == "/**" or node in SCHEMAS}

@@ -149,17 +149,24 @@ def parameters_of(schema: type) -> dict[str, Parameter]:
     return found
 
 
-def build(schema: type[T], values: Mapping[str, object], owner: str = "") -> T:
-    """Instance of `schema` from values by dotted name; what is absent keeps its default.
+def check_values(schema: type, values: Mapping[str, object], owner: str = "") -> dict[str, Any]:
+    """Values by dotted name, each as its field's type.
 
-    Raises ParameterError for an unknown name, a wrong type, a value out of bounds, or values that do not go together.
+    Raises ParameterError for an unknown name, a wrong type or a value out of bounds.
     """
     known = parameters_of(schema)
     for name in values:
         if name not in known:
             raise ParameterError(f"unknown parameter {owner}.{name}: {owner} has {', '.join(known)}")
-    checked = {name: known[name].check(owner, value) for name, value in values.items()}
-    return _assemble(schema, checked)
+    return {name: known[name].check(owner, value) for name, value in values.items()}
+
+
+def build(schema: type[T], values: Mapping[str, object], owner: str = "") -> T:
+    """Instance of `schema` from values by dotted name; what is absent keeps its default.
+
+    Raises ParameterError as `check_values` does, and for values that do not go together.
+    """
+    return _assemble(schema, check_values(schema, values, owner))
 
 
 def _assemble(schema: type[T], values: Mapping[str, Any]) -> T:
@@ -193,7 +200,7 @@ class LoopParameters:
     ts: float = parameter(0.005, "sampling period T_s, the same on all nodes", unit="s", low=1e-6, high=10.0)
     start_time: float = parameter(
         1.0, "instant t_0 of step 0, the same on all nodes; never 0, which means 'no time' in ROS", unit="s",
-        low=1e-3, high=2147483647.0,
+        low=1e-3, high=2e9,
     )  # fmt: skip
     wait_for_subscribers: int = parameter(
         0,

@@ -5,18 +5,15 @@ A file has one section a node, `/**` for all of them, each with `ros__parameters
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-import yaml
-
-from agv_ros.parameters import SHARED, Parameter, ParameterError, build, parameters_of
-
-_EVERY_NODE = ("/**", "**", "/*", "*")
+from agv_ros.parameters import SHARED, Parameter, ParameterError, build, check_values, parameters_of
+from agv_ros.ros_yaml import RosYamlError, load
 
 
 def read_sections(path: str) -> dict[str, dict[str, Any]]:
-    """Sections of a params file: node name (without namespace; `/**` for all) -> value by dotted name.
+    """Sections of a params file in its order: node name (without namespace; `/**` for all) -> value by dotted name.
 
     Raises ParameterError if the file cannot be read or is no parameter file.
     """
@@ -32,22 +29,44 @@ def read_sections(path: str) -> dict[str, dict[str, Any]]:
 def parse_sections(text: str, name: str) -> dict[str, dict[str, Any]]:
     """As `read_sections`, from the text of a file called `name` in messages."""
     try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ParameterError(f"{name}: is not YAML: {' '.join(str(error).split())}") from None
+        content = load(text)
+    except RosYamlError as error:
+        raise ParameterError(f"{name}: {error}") from None
     if not isinstance(content, dict):
         raise ParameterError(f"{name}: no parameters in it; expected sections like 'controller: ros__parameters: ...'")
     sections: dict[str, dict[str, Any]] = {}
-    for node, section in content.items():
-        body = section.get("ros__parameters") if isinstance(section, dict) else None
-        if not isinstance(body, dict):
-            raise ParameterError(f"{name}: section {node!r} has no mapping 'ros__parameters' in it")
-        key = "/**" if node in _EVERY_NODE else str(node).rsplit("/", 1)[-1]
-        sections.setdefault(key, {}).update(_flat(body))
+    origin: dict[tuple[str, str], str] = {}
+    for title, body in _bodies(content, "", name):
+        key = _node_of(title)
+        section = sections.setdefault(key, {})
+        for parameter, value in _flat(body).items():
+            first = origin.setdefault((key, parameter), title)
+            if first != title and section[parameter] != value:
+                raise ParameterError(f"{name}: sections {first} and {title} give {key}.{parameter} two values")
+            section[parameter] = value
     return sections
 
 
-def _flat(tree: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+def _bodies(tree: Mapping[str, Any], namespace: str, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Sections in the order of the file: (name with namespaces, parameters). Namespaces may be levels of their own."""
+    for key, section in tree.items():
+        title = f"{namespace}{key}"
+        if isinstance(section, dict) and "ros__parameters" not in section and section:
+            yield from _bodies(section, f"{title}/", name)
+            continue
+        body = section.get("ros__parameters") if isinstance(section, dict) else None
+        if not isinstance(body, dict):
+            raise ParameterError(f"{name}: section {title!r} has no mapping 'ros__parameters' in it")
+        yield title, body
+
+
+def _node_of(title: str) -> str:
+    """Name of the node that a section is for, without its namespace; `/**` for all."""
+    node = title.rsplit("/", 1)[-1]
+    return "/**" if node in ("*", "**") else node
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in tree.items():
         if isinstance(value, dict):
@@ -59,13 +78,13 @@ def _flat(tree: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
 
 def _is_ros_own(name: str) -> bool:
     """Parameters that every rclpy node has without declaring them here."""
-    return name == "use_sim_time" or name.startswith("qos_overrides.")
+    return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")
 
 
 def parse_setting(text: str, known: Mapping[str, Mapping[str, Parameter]]) -> tuple[str, str, Any]:
     """(node, parameter, value) of a setting `node.parameter=value`; an integer is taken for a double where one is due.
 
-    Raises ParameterError if the text has no such form or names no known parameter.
+    Raises ParameterError if the text has no such form, names no known parameter or gives a value that is not allowed.
     """
     target, equals, literal = text.partition("=")
     node, dot, name = target.strip().partition(".")
@@ -75,14 +94,14 @@ def parse_setting(text: str, known: Mapping[str, Mapping[str, Parameter]]) -> tu
         raise ParameterError(f"--set {text}: unknown node {node!r}, must be one of {', '.join(known)}")
     if name not in known[node]:
         raise ParameterError(f"--set {text}: {node} has no parameter {name!r}, it has {', '.join(known[node])}")
-    return node, name, _value(literal, known[node][name])
+    try:
+        return node, name, known[node][name].check(node, _value(literal, known[node][name]))
+    except (ParameterError, RosYamlError) as error:
+        raise ParameterError(f"--set {text}: {error}") from None
 
 
 def _value(literal: str, parameter: Parameter) -> Any:
-    try:
-        value = literal if parameter.kind == "string" else yaml.safe_load(literal)
-    except yaml.YAMLError:
-        raise ParameterError(f"--set {parameter.name}={literal}: is not a YAML value") from None
+    value = literal if parameter.kind == "string" else load(literal)
     if parameter.kind == "double":
         return _as_double(value)
     if parameter.kind == "double_array" and isinstance(value, list):
@@ -91,13 +110,8 @@ def _value(literal: str, parameter: Parameter) -> Any:
 
 
 def _as_double(value: Any) -> Any:
-    """A double as a person types it: 250, 1e3, inf and nan are not floats to YAML 1.1, but are meant as such."""
-    if isinstance(value, bool):
-        return value
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return value
+    """A number as a person types it: 250 is an integer to ROS, but meant as a double."""
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 def resolve(
@@ -106,44 +120,43 @@ def resolve(
     """Instances of all nodes' schemas from a file's sections and settings, by node name.
 
     A parameter that all nodes share (ts, start_time) and that is set for one node is set for all; two different values
-    are refused. Raises ParameterError, whose text begins with `name`, the file's.
+    are refused. Raises ParameterError, whose text begins with `name`, the file's, or with the setting.
     """
     known = {node: parameters_of(schema) for node, schema in schemas.items()}
-    try:
-        values = {node: _from_file(node, sections, known) for node in schemas}
-        _unknown_sections(sections, schemas)
-        file_shared = _shared(values)
-    except ParameterError as error:
-        raise ParameterError(f"{name}: {error}" if name else str(error)) from None
     chosen: dict[str, dict[str, Any]] = {node: {} for node in schemas}
     for text in settings:
         node, parameter, value = parse_setting(text, known)
         chosen[node][parameter] = value
-    shared = {**file_shared, **_shared(chosen)}
-    resolved: dict[str, Any] = {}
-    for node, schema in schemas.items():
-        own = {**values[node], **chosen[node], **{key: item for key, item in shared.items() if key in known[node]}}
-        resolved[node] = build(schema, own, node)
-    return resolved
+    chosen_shared = _shared(chosen)
+    try:
+        values = {node: _from_file(node, schema, sections) for node, schema in schemas.items()}
+        _refuse_unknown_for_all(sections, known)
+        shared = {**_shared(values), **chosen_shared}
+        return {
+            node: build(schema, {**values[node], **chosen[node], **shared}, node) for node, schema in schemas.items()
+        }
+    except ParameterError as error:
+        raise ParameterError(f"{name}: {error}" if name else str(error)) from None
 
 
-def _from_file(
-    node: str, sections: Mapping[str, Mapping[str, Any]], known: Mapping[str, Mapping[str, Parameter]]
-) -> dict[str, Any]:
-    everywhere = {
-        name: value for name, value in sections.get("/**", {}).items() if name in known[node] or _is_ros_own(name)
-    }
-    merged = {**everywhere, **sections.get(node, {})}
-    return {name: value for name, value in merged.items() if not _is_ros_own(name)}
+def _from_file(node: str, schema: type, sections: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """A node's values, checked. As in ROS, a later section wins, be it the node's or that of all nodes."""
+    known = parameters_of(schema)
+    merged: dict[str, Any] = {}
+    for title, section in sections.items():
+        if title == "/**":
+            merged.update({name: value for name, value in section.items() if name in known})
+        elif title == node:
+            merged.update({name: value for name, value in section.items() if not _is_ros_own(name)})
+    return check_values(schema, merged, node)
 
 
-def _unknown_sections(sections: Mapping[str, Mapping[str, Any]], schemas: Mapping[str, type]) -> None:
-    for node, section in sections.items():
-        if node == "/**":
-            names = {name for schema in schemas.values() for name in parameters_of(schema)}
-            for name in section:
-                if name not in names and not _is_ros_own(name):
-                    raise ParameterError(f"section /**: no node has a parameter {name!r}")
+def _refuse_unknown_for_all(
+    sections: Mapping[str, Mapping[str, Any]], known: Mapping[str, Mapping[str, Parameter]]
+) -> None:
+    for name in sections.get("/**", {}):
+        if not _is_ros_own(name) and not any(name in parameters for parameters in known.values()):
+            raise ParameterError(f"section /**: no node has a parameter {name!r}")
 
 
 def _shared(values: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
