@@ -84,8 +84,6 @@ def cores() -> int:
 
 def _units(rows: int, columns: int, workers: int) -> list[tuple[int, range]]:
     """Work in parts: (column, rows of it), at least `_UNITS_PER_WORKER` a worker where there is enough to do."""
-    parts = min(rows, -(-_UNITS_PER_WORKER * workers // max(columns, 1))) or 1
-    size = -(-rows // parts)
-    return [
-        (column, range(first, min(first + size, rows))) for column in range(columns) for first in range(0, rows, size)
-    ]
+    parts = -(-_UNITS_PER_WORKER * workers // max(1, columns))
+    size = max(1, rows // parts)
+    return [(column, range(rows)[first : first + size]) for column in range(columns) for first in range(0, rows, size)]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from agv_analysis.run import Run
+from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Settings, at_rest, history
@@ -40,7 +40,7 @@ def simulate(scenario: Scenario) -> Run:
         n_ul=n_ul[:done],
         lost=lost[:done],
         downlink_lost=downlink_lost[:done],
-        notes=tuple(_notes(scenario, done, steps)),
+        notes=tuple(_notes(scenario, done, steps, rows[:done, 6:8])),
     )
 
 
@@ -60,8 +60,13 @@ def settings_of(scenario: Scenario) -> Settings:
     return Settings(gains.kx, gains.ky, gains.ktheta, gains.v_max, plant.ts, plant.integration == "arc")
 
 
-def _notes(scenario: Scenario, done: int, steps: int) -> list[str]:
+def _notes(scenario: Scenario, done: int, steps: int, command: Floats) -> list[str]:
     notes = []
+    refused = np.flatnonzero(np.isinf(command).any(axis=1))
+    if len(refused):
+        notes.append(
+            f"{len(refused)} commands were beyond the range of numbers and refused, the first at step {refused[0]}"
+        )
     if done < steps:
         notes.append(f"the loop diverged: after step {done - 1} of {steps} the AGV left the range of numbers")
     if scenario.plant.clock != "lockstep":
