@@ -1,0 +1,17 @@
+"""What can be wrong with a bag."""
+
+from __future__ import annotations
+
+from agv_ros.errors import UserError
+
+
+class BagError(UserError):
+    """A bag that cannot be used; the text names the file, what is wrong with it and, where there is one, the remedy."""
+
+
+class DamagedError(ValueError):
+    """Bytes that are not the record which they are said to be; never leaves this package."""
+
+
+class UndecodableError(ValueError):
+    """A type whose messages cannot become arrays, or a message that is not of its type; the text says why."""

@@ -1,0 +1,49 @@
+"""What a reader finds wrong with a bag, counted by kind, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class _Kind:
+    count: int = 0
+    first: int | None = None
+    messages: int = 0
+    is_loss: bool = False
+
+
+@dataclass
+class Findings:
+    """Everything that was lost, that could not be checked, or that is not as it should be."""
+
+    _kinds: dict[str, _Kind] = field(default_factory=dict)
+
+    def add(
+        self, what: str, count: int = 1, *, at: int | None = None, messages: int = 0, is_loss: bool = False
+    ) -> None:
+        """Count a finding of the kind `what`; `at`: its byte in the file; `messages`: how many went with it."""
+        kind = self._kinds.setdefault(what, _Kind(first=at))
+        kind.count += count
+        kind.messages += messages
+        kind.is_loss |= is_loss
+
+    def merge(self, other: Findings) -> None:
+        """Take over what another reader found."""
+        for what, kind in other._kinds.items():
+            self.add(what, kind.count, at=kind.first, messages=kind.messages, is_loss=kind.is_loss)
+
+    @property
+    def is_loss(self) -> bool:
+        """Is anything known to be missing?"""
+        return any(kind.is_loss for kind in self._kinds.values())
+
+    def texts(self) -> tuple[str, ...]:
+        """One line for each kind."""
+        return tuple(_text(what, kind) for what, kind in self._kinds.items())
+
+
+def _text(what: str, kind: _Kind) -> str:
+    where = "" if kind.first is None else f", the first at byte {kind.first}"
+    messages = f", with {kind.messages} messages" if kind.messages else ""
+    return f"{what}: {kind.count}{where}{messages}"

@@ -1,0 +1,154 @@
+"""Message definitions as a bag carries them (MCAP's `ros2msg`) -> flat list of members, in the order of the wire.
+
+Sources: MCAP registry, `ros2msg`: the definition, then those of the types in it, each after a line of `=` and a line
+`MSG: package/Name`; https://design.ros2.org/articles/legacy_interface_definition.html for the language.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from agv_analysis.bags.errors import UndecodableError
+
+STRING = "string"
+
+PRIMITIVES = {
+    "bool": "?", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2",
+    "uint32": "u4", "int32": "i4", "uint64": "u8", "int64": "i8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+"""Types of fixed size -> numpy's code without byte order; a type is aligned to its size."""
+
+_BUILT_IN = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+}
+"""Types that some writers leave out of their definitions."""
+
+_MAX_DEPTH = 32
+_MAX_MEMBERS = 4096
+"""Bounds on what a definition may ask for; common_interfaces stays below 8 and 100."""
+
+_SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
+_FIELD = re.compile(
+    r"(?P<type>[A-Za-z][\w/]*)(?P<string_bound><=\d+)?"
+    r"(?P<array>\[(?P<bound><=)?(?P<length>\d*)\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>\s*=.*|\s.*|)"
+)
+
+
+@dataclass(frozen=True)
+class Member:
+    """One member of a message on the wire."""
+
+    path: str
+    """Dotted path within its struct."""
+    element: str | Struct
+    """numpy's code of a primitive, STRING, or the struct that an array consists of."""
+    length: int | None = None
+    """Elements of an array, None for a single value; the bound of a sequence, None where it has none."""
+    is_sequence: bool = False
+
+
+@dataclass(frozen=True)
+class Struct:
+    """A message, or what an array of messages consists of; messages that are single members are unfolded into it."""
+
+    members: tuple[Member, ...]
+
+    @property
+    def has_sequences(self) -> bool:
+        """Can two messages of this type differ in their number of values?"""
+        return any(m.is_sequence or (isinstance(m.element, Struct) and m.element.has_sequences) for m in self.members)
+
+
+def parse_schema(name: str, encoding: str, text: str) -> Struct:
+    """Members of the type `name` ("geometry_msgs/msg/PoseStamped").
+
+    Raises UndecodableError if the text is not understood, lacks a type, or describes a type without end.
+    """
+    if encoding != "ros2msg":
+        raise UndecodableError(f"its definition is in {encoding or 'no language'!r}; only ros2msg is read")
+    texts = {**_BUILT_IN, **_by_name(_short(name), text)}
+    return Struct(tuple(_Unfolding(texts).members(_short(name), "", 0)))
+
+
+def _short(name: str) -> str:
+    return name.replace("/msg/", "/")
+
+
+def _by_name(name: str, text: str) -> dict[str, str]:
+    """Text of each type in a definition."""
+    first, *others = _SEPARATOR.split(text)
+    texts = {name: first}
+    for other in others:
+        head, _, body = other.strip().partition("\n")
+        if not head.startswith("MSG:"):
+            raise UndecodableError(f"its definition has a part that begins with {head[:60]!r} instead of 'MSG: type'")
+        texts[_short(head[4:].strip())] = body
+    return texts
+
+
+class _Unfolding:
+    """Unfolds a type into members, counting them."""
+
+    def __init__(self, texts: dict[str, str]) -> None:
+        self._texts = texts
+        self._count = 0
+
+    def members(self, name: str, prefix: str, depth: int) -> Iterator[Member]:
+        """Members of the type `name`, their paths beginning with `prefix`."""
+        if depth > _MAX_DEPTH:
+            raise UndecodableError(f"its definition is nested more than {_MAX_DEPTH} deep")
+        empty = True
+        for line in self._texts[name].splitlines():
+            member = _parse_line(line)
+            if member is None:
+                continue
+            empty = False
+            self._count += 1
+            if self._count > _MAX_MEMBERS:
+                raise UndecodableError(f"its definition has more than {_MAX_MEMBERS} members")
+            yield from self._unfold(name, prefix, member, depth)
+        if empty:  # IDL knows no struct without members, so ROS 2 puts one there
+            yield Member(f"{prefix}structure_needs_at_least_one_member", "u1")
+
+    def _unfold(self, parent: str, prefix: str, member: Member, depth: int) -> Iterator[Member]:
+        path, kind = prefix + member.path, str(member.element)
+        is_array = member.is_sequence or member.length is not None
+        if kind == STRING or kind in PRIMITIVES:
+            yield Member(path, PRIMITIVES.get(kind, STRING), member.length, member.is_sequence)
+        elif is_array:
+            struct = Struct(tuple(self.members(self._resolve(kind, parent), "", depth + 1)))
+            yield Member(path, struct, member.length, member.is_sequence)
+        else:
+            yield from self.members(self._resolve(kind, parent), f"{path}.", depth + 1)
+
+    def _resolve(self, kind: str, parent: str) -> str:
+        """Full name of a type as a member of `parent` names it."""
+        short = _short(kind)
+        package = parent.rpartition("/")[0]
+        candidates = [short] if "/" in short else [f"{package}/{short}", f"std_msgs/{short}"]
+        for candidate in candidates:
+            if candidate in self._texts:
+                return candidate
+        raise UndecodableError(f"its definition uses the type {kind!r} without describing it")
+
+
+def _parse_line(line: str) -> Member | None:
+    """The member that a line declares, its type by name; None for a constant or a comment."""
+    line = line.strip()
+    if not line or line.startswith("#"):
+        return None
+    found = _FIELD.match(line)
+    if found is None:
+        raise UndecodableError(f"its definition has a line that is not understood: {line[:80]!r}")
+    if found["rest"].lstrip().startswith("="):
+        return None
+    if found["type"] == "wstring":
+        raise UndecodableError(f"its member {found['name']!r} is a wstring, which is not decoded")
+    length = int(found["length"]) if found["length"] else None
+    if length is not None and length > 2**32:
+        raise UndecodableError(f"its member {found['name']!r} has {length} elements")
+    is_sequence = found["array"] is not None and (length is None or found["bound"] is not None)
+    return Member(found["name"], found["type"], length, is_sequence)

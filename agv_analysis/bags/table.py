@@ -1,0 +1,255 @@
+"""Messages of one topic -> one structured array that grows as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.bags.batch import Batch, Bytes, Group, Ints, Layouts, values_at
+from agv_analysis.bags.errors import UndecodableError
+from agv_analysis.bags.layout import Index, Layout, Leaf, length_path
+from agv_analysis.bags.schema import STRING, Struct
+
+LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
+
+_MISFITS_BELIEVED = 100
+"""So many messages, and not one of its type: then the definition is not theirs."""
+
+_PADDING_FREE = 64 * 2**20
+_PADDING_FACTOR = 16
+"""A table may take this many bytes, or this many times the bytes of its messages: since every row is as wide as the
+longest string or sequence, one long message among many short ones could otherwise ask for any amount of memory."""
+
+_MAX_ROOM = 2**30
+"""Most bytes that are set aside for messages which are merely expected."""
+
+
+@dataclass
+class _Column:
+    """What is known of a column so far."""
+
+    code: str
+    """numpy's code in this machine's byte order; S for strings."""
+    dims: list[int]
+    """Shape of a row's values; grows with the longest sequence."""
+    width: int = 1
+    """Bytes of a string; grows with the longest."""
+
+    @property
+    def format(self) -> Any:
+        """As numpy.dtype wants it."""
+        code = f"S{self.width}" if self.code == "S" else self.code
+        return (code, tuple(self.dims)) if self.dims else code
+
+    def fit(self, leaf: Leaf) -> None:
+        """Make room for the values of a leaf."""
+        if self.code == "S":
+            self.width = max(self.width, int(leaf.code[1:]))
+        inner = () if leaf.block is None else (leaf.block - 1,)
+        self.fit_places([(*index, *inner) for index in leaf.indices])
+
+    def fit_places(self, places: list[Index]) -> None:
+        """Make room for values at `places`."""
+        if self.dims:
+            self.dims = [max(n, 1 + i) for n, i in zip(self.dims, np.max(places, axis=0).tolist(), strict=True)]
+
+
+def _columns(kind: Struct, prefix: str = "", dims: tuple[int, ...] = ()) -> Iterator[tuple[str, _Column]]:
+    """Columns of a type in the order of its members; no sequence has any elements yet."""
+    for member in kind.members:
+        path, inner = prefix + member.path, dims
+        if member.is_sequence:
+            yield length_path(path), _Column("u4", list(dims))
+            inner = (*dims, 0)
+        elif member.length is not None:
+            inner = (*dims, member.length)
+        if isinstance(member.element, Struct):
+            yield from _columns(member.element, f"{path}.", inner)
+        elif not path.endswith("structure_needs_at_least_one_member"):
+            yield path, _Column("S" if member.element == STRING else member.element, list(inner))
+
+
+class _Run(NamedTuple):
+    """Bytes that lie side by side in the message and, just so, in the row."""
+
+    source: int
+    target: int
+    size: int
+
+    def is_before(self, other: _Run) -> bool:
+        """Does the other follow without a gap, in the message as in the row?"""
+        return self.source + self.size == other.source and self.target + self.size == other.target
+
+
+class Table:
+    """Columns of a topic: `log_time_ns`, `publish_time_ns`, and one for each value of its type."""
+
+    def __init__(self, kind: Struct, expected: int = 0) -> None:
+        """`expected`: messages to make room for; more may come."""
+        self._columns = {LOG_TIME: _Column("i8", []), PUBLISH_TIME: _Column("i8", []), **dict(_columns(kind))}
+        self._ragged = kind.has_sequences
+        self._expected = expected
+        self._fitted: set[int] = set()
+        self._plans: dict[int, tuple[list[_Run], list[Leaf]]] = {}
+        self._dtype = self._make_dtype()
+        self._store = np.empty(0, np.uint8)
+        self._capacity = 0
+        self._count = 0
+        self._payload_bytes = 0
+        self.layouts = Layouts(kind)
+
+    @property
+    def rows(self) -> NDArray[np.void]:
+        """The messages so far, one row each."""
+        size = self._dtype.itemsize
+        return self._store[: self._count * size].view(self._dtype)
+
+    def append(self, batch: Batch) -> None:
+        """Take a batch, except for those messages that are not of the table's type.
+
+        Raises UndecodableError if none of the topic's messages is of its type, or if the array would grow out of all
+        proportion to its messages.
+        """
+        groups = self.layouts.split(batch)
+        self._payload_bytes += int(batch.sizes.sum())
+        fits = np.zeros(len(batch), np.bool_)
+        for group in groups:
+            fits[group.places] = True
+            self._widen(group.layout)
+        first, number = self._count, int(fits.sum())
+        if first + number == 0 and self.layouts.misfits >= _MISFITS_BELIEVED:
+            raise UndecodableError(f"its messages are not of its type: {self.layouts.first_misfit}")
+        if first + number > self._capacity:
+            self._move(self._dtype, first + number, max(2 * self._capacity, self._expected))
+        self._count += number
+        new = self.rows[first:]
+        if self._ragged:
+            new[:] = self._blank()
+        new[LOG_TIME] = batch.log_time[fits]
+        new[PUBLISH_TIME] = batch.publish_time[fits]
+        ranks = np.cumsum(fits) - 1
+        for group in groups:
+            self._write(group, new, slice(None) if len(group.places) == number else ranks[group.places])
+
+    # -- storage -----------------------------------------------------------------------------------------------------
+
+    def _make_dtype(self) -> np.dtype[np.void]:
+        formats = [column.format for column in self._columns.values()]
+        return np.dtype({"names": list(self._columns), "formats": formats}, align=True)
+
+    def _widen(self, layout: Layout) -> None:
+        """Make the columns wide enough for a layout."""
+        if id(layout) in self._fitted:
+            return
+        self._fitted.add(id(layout))
+        for leaf in layout.leaves:
+            if leaf.path in self._columns:
+                self._columns[leaf.path].fit(leaf)
+        for path, counts in layout.counts.items():
+            self._columns[length_path(path)].fit_places(list(counts))
+        dtype = self._make_dtype()
+        if dtype != self._dtype:
+            self._move(dtype, self._count, self._capacity)
+            self._plans.clear()
+
+    def _move(self, dtype: np.dtype[np.void], rows: int, room: int) -> None:
+        """Move the rows to a new store for `rows` rows, or for `room` if that is more and not too much."""
+        needed = rows * dtype.itemsize
+        if needed > max(_PADDING_FREE, _PADDING_FACTOR * self._payload_bytes):
+            raise UndecodableError(
+                f"its strings or sequences differ so much in length that {rows} messages would take "
+                f"{needed / 2**20:.0f} MiB as an array"
+            )
+        old = self.rows
+        self._capacity = max(rows, min(room, _MAX_ROOM // dtype.itemsize))
+        self._store = np.empty(self._capacity * dtype.itemsize, np.uint8)
+        self._dtype = dtype
+        new = self.rows
+        if old.dtype == dtype:
+            new[:] = old
+            return
+        new[:] = self._blank()
+        for name in old.dtype.names or ():
+            place = (slice(None), *(slice(0, n) for n in old.dtype[name].shape))
+            new[name][place] = old[name]
+
+    def _blank(self) -> NDArray[np.void]:
+        """A row without any value: NaN, zero, empty."""
+        blank = np.zeros((), self._dtype)
+        for name in self._dtype.names or ():
+            if self._dtype[name].base.kind == "f":
+                blank[name] = np.nan
+        return blank
+
+    # -- values ------------------------------------------------------------------------------------------------------
+
+    def _plan(self, layout: Layout) -> tuple[list[_Run], list[Leaf]]:
+        """How to copy messages of a layout: what can be copied as runs of bytes, and the leaves that cannot."""
+        runs: list[_Run] = []
+        others: list[Leaf] = []
+        for leaf in layout.leaves:
+            run = self._run(leaf)
+            if run is None:
+                if leaf.path in self._columns:
+                    others.append(leaf)
+            elif runs and runs[-1].is_before(run):
+                runs[-1] = _Run(runs[-1].source, runs[-1].target, run.source + run.size - runs[-1].source)
+            else:
+                runs.append(run)
+        return runs, others
+
+    def _run(self, leaf: Leaf) -> _Run | None:
+        """A leaf as bytes, None if its values are in another form than in the table."""
+        column = self._dtype.fields.get(leaf.path) if self._dtype.fields else None
+        if column is None or leaf.indices != [()]:
+            return None
+        kind, target = column[0], int(column[1])
+        if kind.base != np.dtype(leaf.code) or kind.shape != (() if leaf.block is None else (leaf.block,)):
+            return None
+        return _Run(leaf.offsets[0], target, kind.itemsize)
+
+    def _write(self, group: Group, new: NDArray[np.void], rows: slice | Ints) -> None:
+        """Write the messages of a group to the rows `rows` of `new`."""
+        if id(group.layout) not in self._plans:
+            self._plans[id(group.layout)] = self._plan(group.layout)
+        runs, leaves = self._plans[id(group.layout)]
+        store, size = new.view(np.uint8), self._dtype.itemsize
+        for source, target, length in runs:
+            column = np.ndarray((len(new),), f"V{length}", store.data, target, (size,))
+            column[rows] = values_at(group.payloads, source, f"V{length}")
+        for leaf in leaves:
+            _write_leaf(new[leaf.path], rows, leaf, group.payloads)
+        for path, counts in group.layout.counts.items():
+            lengths = new[length_path(path)]
+            for index, count in counts.items():
+                place = (rows, *index)
+                lengths[place] = count
+
+
+def _write_leaf(column: NDArray[Any], rows: slice | Ints, leaf: Leaf, payloads: Bytes) -> None:
+    """Write the values of a leaf to the rows `rows` of a column."""
+    block = () if leaf.block is None else (slice(0, leaf.block),)
+    values = _values(payloads, leaf)
+    if leaf.indices == [()]:
+        place: tuple[Any, ...] = (rows, *block)
+        column[place] = values[:, 0]
+        return
+    numbers = np.arange(len(column))[rows]
+    place = (numbers[:, None], *np.array(leaf.indices).T[:, None, :], *block)
+    column[place] = values
+
+
+def _values(payloads: Bytes, leaf: Leaf) -> NDArray[Any]:
+    """All values of a leaf, shape (n, k) or, for blocks of b values, (n, k, b)."""
+    n, size = payloads.shape
+    item = np.dtype(leaf.code).itemsize
+    if leaf.block is None:
+        windows: NDArray[Any] = np.ndarray((n, size - item + 1), leaf.code, payloads.data, strides=(size, 1))
+    else:
+        shape = (n, size - item * leaf.block + 1, leaf.block)
+        windows = np.ndarray(shape, leaf.code, payloads.data, strides=(size, 1, item))
+    return windows[:, leaf.offsets]
