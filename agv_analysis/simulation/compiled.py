@@ -94,14 +94,17 @@ def _cache_folder(function: types.FunctionType) -> Path | None:
     """
     if function.__closure__:
         return None
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "agv_ncs"
-    folder = base / _digest(function)
     try:
+        folder = _cache_base() / _digest(function)
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    except (OSError, RuntimeError):  # Path.home() may not exist
         return None
     return folder if os.access(folder, os.W_OK) else None
+
+
+def _cache_base() -> Path:
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "agv_ncs"
 
 
 def _digest(function: types.FunctionType) -> str:
