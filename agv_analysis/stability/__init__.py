@@ -1,0 +1,1 @@
+"""Is the loop stable under outages?"""

@@ -1,0 +1,246 @@
+"""Arbitrary bursts: between two receptions up to n_max updates are lost, in any order and as often as nature likes.
+
+The error goes from one reception to the next by one of the maps M_1 .. M_L, L = n_max + 1 (see `linearisation`), so the
+loop is a switched system and stable if the joint spectral radius of the maps is below 1. It is bounded from both sides:
+
+- below, by what one sequence does: a lap driven with bursts of equal length, for each length;
+- above, by a norm x' P x common to all maps (a certificate, found by the ellipsoid method) and the worst growth of that
+  norm over a lap among all sequences, which is the largest weight of a path and so exact dynamic programming.
+
+Both are given as growth per step, over a lap that is driven again and again with the speeds that it has; speeds may
+change inside a burst. A parked AGV can keep the certificate from falling for a while: the lap as a whole decides.
+
+On a straight track at constant speed each repeated burst has a closed form. Along the track M_L = 1 - a L, so L a < 2;
+across it, from the characteristic polynomial of M_L: (L + 1) T_s v K_y < 2 K_theta and
+L T_s v (2 K_theta - T_s v K_y) < 4.
+
+Literature: Liberzon, Switching in Systems and Control, 2003; Jungers, The Joint Spectral Radius, 2009.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_analysis.stability.linearisation import burst_maps, reachable, step_matrices
+from agv_analysis.stability.products import log_spectral_radius
+from agv_cloud.parameters import ControllerParameters
+
+STABLE = "stable"
+UNSTABLE = "unstable"
+UNDECIDED = "undecided"
+
+_MARGINAL = -1e-13
+"""Growth per step (logarithm) above which a sequence counts as not dying out: round-off is 1e-16, and marginal is not
+stable."""
+
+
+@dataclass(frozen=True)
+class BurstVerdict:
+    """Is the loop stable for arbitrary bursts of up to `n_max` lost updates?"""
+
+    n_max: int
+    verdict: str
+    """stable (proved), unstable (a sequence that does not die out was found) or undecided."""
+    lower: float
+    """Largest growth per step that a sequence was found to have: a lower bound on the joint spectral radius."""
+    upper: float
+    """Upper bound on it, inf where no common norm was sought or found."""
+    worst: int
+    """Burst length (lost updates) whose repetition gives `lower`."""
+    certificate: Floats | None
+    """P of the common norm x' P x behind `upper`, shape (m, m); m = 3 unless the AGV is parked throughout."""
+
+
+def verdict(n_max: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> BurstVerdict:
+    """Verdict for arbitrary bursts up to `n_max` >= 0 on a lap with the speeds v_r [m/s], w_r [rad/s] of shape (N,)."""
+    F, G = _lap(v_r, w_r, gains, ts)
+    growth = list(_repeated_growths(F, G, n_max + 1))
+    worst = int(np.argmax(growth))
+    lower = math.exp(growth[worst])
+    if growth[worst] > _MARGINAL:
+        return BurstVerdict(n_max, UNSTABLE, lower, math.inf, worst, None)
+    certificate = _common_norm(_sample(F, G, np.abs(v_r), n_max + 1))
+    if certificate is None:
+        return BurstVerdict(n_max, UNDECIDED, lower, math.inf, worst, None)
+    upper = math.exp(_worst_growth(F, G, n_max + 1, certificate))
+    return BurstVerdict(n_max, STABLE if upper < 1.0 else UNDECIDED, lower, upper, worst, certificate)
+
+
+def largest_n(
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 1000
+) -> tuple[int | None, int | None]:
+    """(largest n_max that is proved stable, smallest n that is proved unstable) on a lap; arguments as of `verdict`.
+
+    The first is -1 if not even a loop without losses is proved stable, the second None if there is none up to `limit`;
+    both None: stable up to `limit`. They are neighbours unless what lies between them is undecided.
+    """
+    refuted = next(
+        (n for n, growth in enumerate(_repeated_growths(*_lap(v_r, w_r, gains, ts), limit + 1)) if growth > _MARGINAL),
+        None,
+    )
+    proved, beyond = -1, limit + 1 if refuted is None else refuted
+    attempt = beyond - 1  # just below what is refuted: nearly always proved at once
+    while proved < beyond - 1:
+        if verdict(attempt, v_r, w_r, gains, ts).verdict == STABLE:
+            proved = attempt
+        else:
+            beyond = attempt
+        attempt = (proved + beyond) // 2
+    return (None if proved == limit else proved), refuted
+
+
+def largest_n_along(a: float) -> int | None:
+    """Largest n with (n + 1) a < 2, a = T_s K_x; -1 if there is none, None (no limit) for a = 0, which is marginal."""
+    return None if a == 0.0 else max(-1, math.ceil(2.0 / a) - 2)
+
+
+def largest_n_across(v: float, gains: ControllerParameters, ts: float) -> int | None:
+    """Largest n whose repetition contracts across a straight track at the constant speed `v` > 0 [m/s].
+
+    -1 if not even a loop without losses contracts, None if there is no limit.
+    """
+    step, ky, ktheta = ts * v, gains.ky, gains.ktheta
+    if step <= 0.0 or ky == 0.0 or ktheta == 0.0:
+        return -1
+    longest = 2.0 * ktheta / (step * ky) - 1.0
+    if 2.0 * ktheta > step * ky:
+        longest = min(longest, 4.0 / (step * (2.0 * ktheta - step * ky)))
+    return max(-1, math.ceil(longest) - 2)
+
+
+def _lap(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> tuple[Floats, Floats]:
+    """F and G of the lap's steps, of what the AGV can reach alone; a single row where speeds are constant."""
+    if np.ptp(v_r) == 0.0 and np.ptp(w_r) == 0.0:
+        v_r, w_r = v_r[:1], w_r[:1]
+    size = reachable(v_r, w_r)
+    F, G = step_matrices(v_r, w_r, gains, ts)
+    return F[:, :size, :size], G[:, :size, :size]
+
+
+def _repeated_growths(F: Floats, G: Floats, longest: int) -> Iterator[float]:
+    """Growth (logarithm, per step) of the sequence that repeats bursts of L steps, for L = 1 .. longest.
+
+    The last burst of a lap is cut short by its end.
+    """
+    steps, shorter = len(F), [np.broadcast_to(np.eye(F.shape[-1]), F.shape)]
+    for length, M in enumerate(burst_maps(F, G, longest), start=1):
+        if steps == 1:
+            yield log_spectral_radius(M) / length
+            continue
+        shorter.append(M)
+        whole, rest = divmod(steps, length)
+        lap = M[: whole * length : length] if whole else M[:0]
+        if rest:
+            lap = np.concatenate((lap, shorter[rest][whole * length :][:1]))
+        yield log_spectral_radius(lap) / steps
+
+
+def _sample(F: Floats, G: Floats, speed: Floats, longest: int) -> Floats:
+    """Maps of all burst lengths from a few dozen steps at which the AGV moves, shape (M, m, m)."""
+    moving = np.flatnonzero(speed > 0.05 * speed.max()) if len(F) > 1 else np.zeros(1, dtype=np.int64)
+    moving = moving[:: max(1, len(moving) // 48)]
+    return np.concatenate([M[moving] for M in burst_maps(F, G, longest)])
+
+
+def _common_norm(maps: Floats) -> Floats | None:
+    """P > 0 with M' P M < P for each of the maps, shape (M, m, m); None if the search ends without one.
+
+    The ellipsoid method with deep cuts (Bland, Goldfarb and Todd, Oper. Res. 29, 1981) over the entries of P. First P
+    without terms that couple along and across is sought for: it stays a norm that never grows while the AGV is parked.
+    """
+    size = maps.shape[-1]
+    entries = [(i, j) for i in range(size) for j in range(i, size)]
+    apart = [(i, j) for i, j in entries if i > 0 or j == 0]
+    for free in (apart, entries) if len(apart) < len(entries) else (entries,):
+        found = _ellipsoid(maps, free)
+        if found is not None:
+            return found
+    return None
+
+
+def _ellipsoid(maps: Floats, entries: list[tuple[int, int]]) -> Floats | None:
+    n, size = len(entries), maps.shape[-1]
+    basis = np.zeros((n, size, size))
+    for entry, (i, j) in zip(basis, entries, strict=True):
+        entry[i, j] = entry[j, i] = 1.0
+    centre, shape = np.array([float(i == j) for i, j in entries]), 100.0 * np.eye(n)
+    for _ in range(150 * n):
+        cut = _violation(maps, np.tensordot(centre, basis, 1))
+        if cut is None:
+            return np.asarray(np.tensordot(centre, basis, 1))
+        outer, depth = cut
+        slope = np.tensordot(basis, outer, 2)
+        width = math.sqrt(max(0.0, float(slope @ shape @ slope)))
+        if n == 1 or depth >= width:
+            return None
+        deep = (1.0 + n * depth / width) / (n + 1.0)
+        direction = shape @ slope / width
+        centre = centre - deep * direction
+        shape = (n * n / (n * n - 1.0)) * (1.0 - (depth / width) ** 2) * (
+            shape - 2.0 * deep / (1.0 + depth / width) * np.outer(direction, direction)
+        )  # fmt: skip
+    return None
+
+
+def _violation(maps: Floats, P: Floats) -> tuple[Floats, float] | None:
+    """(W, depth) with trace(W P) = depth >= 0 although every solution has trace(W P) < 0; None if P is a solution."""
+    values, vectors = np.linalg.eigh(P)
+    if values[0] <= 1e-9 * values[-1]:
+        x = vectors[:, 0]
+        return -np.outer(x, x), float(max(0.0, -values[0]))
+    values, vectors = np.linalg.eigh(np.swapaxes(maps, 1, 2) @ P @ maps - P)
+    worst = int(values[:, -1].argmax())
+    if values[worst, -1] < 0.0:
+        return None
+    x = vectors[worst, :, -1]
+    y = maps[worst] @ x
+    return np.outer(y, y) - np.outer(x, x), float(values[worst, -1])
+
+
+def _worst_growth(F: Floats, G: Floats, longest: int, P: Floats) -> float:
+    """Upper bound on the growth (logarithm, per step) of sqrt(x' P x) for any sequence of bursts up to `longest` steps.
+
+    With V(k) the largest growth from step k to the end of the lap, V(k) = max_L [log norm of M_L(k) + V(k + L)]. For
+    any values W assumed beyond the end, max_k V(k) - W(k) bounds the growth of a lap (Collatz-Wielandt, max-plus).
+    """
+    log_norms = np.stack([_log_norms(M, P) for M in burst_maps(F, G, longest)], axis=1)
+    if len(F) == 1:
+        return float((log_norms[0] / np.arange(1, longest + 1)).max())
+    log_norms = np.tile(log_norms, (-(-longest // len(F)), 1))
+    steps = len(log_norms)
+    beyond = np.zeros(longest)
+    for _ in range(2):
+        V = np.concatenate((np.empty(steps), beyond))
+        for k in range(steps - 1, -1, -1):
+            V[k] = (log_norms[k] + V[k + 1 : k + 1 + longest]).max()
+        growth = float((V[:longest] - beyond).max())
+        beyond = V[:longest] - V[0]
+    return growth / steps
+
+
+def _log_norms(maps: Floats, P: Floats) -> Floats:
+    """Logarithm of the norm of each map, shape (N, m, m), in the vector norm sqrt(x' P x); shape (N,)."""
+    root = np.linalg.cholesky(P).T
+    inner = root @ maps @ np.linalg.inv(root)
+    return np.asarray(0.5 * np.log(_largest_eigenvalues(np.swapaxes(inner, 1, 2) @ inner)))
+
+
+def _largest_eigenvalues(S: Floats) -> Floats:
+    """Largest eigenvalue of symmetric matrices of shape (N, m, m): for m = 3 by Smith's closed form (CACM 4, 1961)."""
+    if S.shape[-1] != 3:
+        return np.asarray(np.linalg.eigvalsh(S)[:, -1])
+    mean = np.trace(S, axis1=1, axis2=2) / 3.0
+    B = S - mean[:, None, None] * np.eye(3)
+    spread = np.sqrt((B * B).sum(axis=(1, 2)) / 6.0)
+    det = (
+        B[:, 0, 0] * (B[:, 1, 1] * B[:, 2, 2] - B[:, 1, 2] ** 2)
+        - B[:, 0, 1] * (B[:, 0, 1] * B[:, 2, 2] - B[:, 1, 2] * B[:, 0, 2])
+        + B[:, 0, 2] * (B[:, 0, 1] * B[:, 1, 2] - B[:, 1, 1] * B[:, 0, 2])
+    )
+    cos3 = np.clip(det / np.maximum(2.0 * spread**3, 1e-300), -1.0, 1.0)
+    return np.asarray(mean + 2.0 * spread * np.cos(np.arccos(cos3) / 3.0))

@@ -1,0 +1,60 @@
+"""The loop to first order about its reference: what all criteria but the paper's start from.
+
+With eps = T_e(theta_c) [X_r - X_c] the tracking error obeys, for a command computed from an error that is n steps old,
+
+    e(k+1) = F(k) e(k) + G(k) e(k-n),    phi = T_s w_r(k),  v = v_r(k)
+
+                 [1  0  0    ]                     [K_x  0      0        ]              [ cos phi  sin phi  0]
+    F = R(-phi)  [0  1  T_s v],   G = -T_s R(-phi) [0    0      0        ],   R(-phi) = [-sin phi  cos phi  0]
+                 [0  0  1    ]                     [0    v K_y  v K_theta]              [ 0        0        1]
+
+F and G hold the speeds of step k alone, so speeds may change inside a burst. The equation is exact to first order where
+zero error is an equilibrium: X_r(k-n) compared with X_c(k-n). The paper compares X_r(k) with X_c(k-n), so its loop
+settles n steps ahead of the reference; about that motion the equation is the same while speeds are constant, and off by
+the change of speeds over n steps otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_cloud.parameters import ControllerParameters
+
+
+def step_matrices(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> tuple[Floats, Floats]:
+    """F and G at the speeds v_r [m/s], w_r [rad/s] of shape (N,); each of shape (N, 3, 3)."""
+    phi = ts * w_r
+    cos, sin, zero, one = np.cos(phi), np.sin(phi), np.zeros(len(v_r)), np.ones(len(v_r))
+    F = np.array([[cos, sin, sin * ts * v_r], [-sin, cos, cos * ts * v_r], [zero, zero, one]])
+    G = -ts * np.array(
+        [[cos * gains.kx, zero, zero], [-sin * gains.kx, zero, zero], [zero, v_r * gains.ky, v_r * gains.ktheta]]
+    )
+    return np.moveaxis(F, 2, 0).copy(), np.moveaxis(G, 2, 0).copy()
+
+
+def reachable(v_r: Floats, w_r: Floats) -> int:
+    """How many of (x_e, y_e, theta_e) the commands can move on a track with these speeds: all 3 if it moves at all.
+
+    A parked AGV reaches only x_e; one that turns on the spot mixes y_e into it and reaches 2. The rest stays as it is.
+    """
+    if np.any(v_r != 0.0):
+        return 3
+    return 2 if np.any(w_r != 0.0) else 1
+
+
+def burst_maps(F: Floats, G: Floats, longest: int) -> Iterator[Floats]:
+    """Maps of the error from one reception to the next, L = 1 .. longest steps later, each of the shape of F.
+
+    Row k of the L-th is M_L(k): e(k + L) = M_L(k) e(k) if step k was received and the next L - 1 steps were lost:
+    M_0 = I, M_{i+1}(k) = F(k+i) M_i(k) + G(k+i); at constant speeds M_L = F^L + sum_{i<L} F^i G. Rows of F and G, shape
+    (N, m, m), are the steps of a lap that is driven again and again.
+    """
+    steps = len(F)
+    M = np.broadcast_to(np.eye(F.shape[-1]), F.shape)
+    for i in range(longest):
+        now = (np.arange(steps) + i) % steps
+        M = F[now] @ M + G[now]
+        yield M

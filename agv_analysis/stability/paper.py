@@ -1,0 +1,110 @@
+"""The paper's test: eigenvalues of A(k) (eq. 55) at every step, |lambda| < 1 (eq. 56).
+
+A(k) sums the Jacobians of X_c(k+1) with respect to X_c(k) and to X_c(k-n): it treats the outdated pose as if it were
+the current one. With mu = 1 - lambda and Delta = theta_c(k) - theta_c(k-n) its characteristic polynomial is
+
+    mu^3 - (a cos Delta + b) mu^2 + (a b + c) cos Delta mu - a c = 0,  a = T_s K_x, b = T_s v K_theta, c = T_s^2 v^2 K_y
+
+with v = v_r(k-n). So the outdated pose enters through Delta alone, and on a straight track not at all. The literal
+eq. 55 has the commanded speed nu(k-n) instead of v_r(k-n) in A(3,2); `v_literal` keeps that form.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_cloud.parameters import ControllerParameters
+
+
+def matrices(
+    theta: Floats,
+    theta_held: Floats,
+    v_held: Floats,
+    gains: ControllerParameters,
+    ts: float,
+    v_literal: Floats | None = None,
+) -> Floats:
+    """A(k) of eq. 55, shape (N, 3, 3).
+
+    theta = theta_c(k) and theta_held = theta_c(k-n) [rad], v_held = v_r(k-n) [m/s], all of shape (N,); v_literal =
+    nu(k-n) [m/s] where A(3,2) shall be as printed.
+    """
+    cos, sin, cos_held, sin_held = np.cos(theta), np.sin(theta), np.cos(theta_held), np.sin(theta_held)
+    v_32 = v_held if v_literal is None else v_literal
+    A = np.empty((len(theta), 3, 3))
+    A[:, 0, 0] = 1.0 - ts * gains.kx * cos * cos_held
+    A[:, 0, 1] = -ts * gains.kx * cos * sin_held
+    A[:, 0, 2] = -ts * sin * v_held
+    A[:, 1, 0] = -ts * gains.kx * sin * cos_held
+    A[:, 1, 1] = 1.0 - ts * gains.kx * sin * sin_held
+    A[:, 1, 2] = ts * cos * v_held
+    A[:, 2, 0] = ts * gains.ky * sin_held * v_held
+    A[:, 2, 1] = -ts * gains.ky * cos_held * v_32
+    A[:, 2, 2] = 1.0 - ts * gains.ktheta * v_held
+    return A
+
+
+def spectral_radii(
+    theta: Floats,
+    theta_held: Floats,
+    v_held: Floats,
+    gains: ControllerParameters,
+    ts: float,
+    v_literal: Floats | None = None,
+) -> Floats:
+    """Spectral radius of A(k), shape (N,); arguments as of `matrices`.
+
+    From the characteristic cubic in mu = 1 - lambda, whose small roots keep their relative accuracy.
+    """
+    cos, sin, cos_held, sin_held = np.cos(theta), np.sin(theta), np.cos(theta_held), np.sin(theta_held)
+    v_32 = v_held if v_literal is None else v_literal
+    a, b = ts * gains.kx, ts * gains.ktheta * v_held
+    cos_delta = cos * cos_held + sin * sin_held
+    across = ts * ts * gains.ky * v_held
+    second = (a * b) * cos_delta + across * (cos * cos_held * v_32 + sin * sin_held * v_held)
+    third = a * across * (cos_held**2 * v_32 + sin_held**2 * v_held)
+    return _largest_distance_from_one(a * cos_delta + b, second, third)
+
+
+def _largest_distance_from_one(t: Floats, s: Floats, d: Floats) -> Floats:
+    """max |1 - mu| over the roots of mu^3 - t mu^2 + s mu - d."""
+    real = _real_root(t, s, d)
+    # The other two are the roots of mu^2 - total mu + product. Dividing the cubic from its high end loses the small
+    # roots to rounding where `real` is large, from its low end where it is small.
+    large = np.abs(real) ** 3 > np.abs(d)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        product = np.where(large, d / real, s - real * (t - real))
+        total = np.where(large & (real != 0.0), (s - product) / real, t - real)
+    half = 0.5 * total
+    discriminant = half * half - product
+    root = np.sqrt(np.abs(discriminant))
+    outer = half + np.copysign(root, half)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inner = np.where(outer != 0.0, product / outer, 0.0)
+    of_pair = np.where(
+        discriminant < 0.0,
+        np.hypot(1.0 - half, root),
+        np.maximum(np.abs(1.0 - outer), np.abs(1.0 - inner)),
+    )
+    return np.asarray(np.maximum(np.abs(1.0 - real), of_pair))
+
+
+def _real_root(t: Floats, s: Floats, d: Floats) -> Floats:
+    """An outer real root of mu^3 - t mu^2 + s mu - d.
+
+    Newton's method from beyond the outer root on the side where the value at the inflection says that it lies; it
+    converges from there without overshooting (Kahan, To Solve a Real Cubic Equation, 1986).
+    """
+    x = t / 3.0
+    value, slope = ((x - t) * x + s) * x - d, s - t * x
+    reach = 1.324718 * np.maximum(np.cbrt(np.abs(value)), np.sqrt(np.maximum(-slope, 0.0)))
+    x = x - np.copysign(reach, value)
+    for _ in range(60):
+        slope = (3.0 * x - 2.0 * t) * x + s
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.where(slope != 0.0, (((x - t) * x + s) * x - d) / slope, 0.0)
+        x = x - step
+        if np.all(np.abs(step) <= 1e-15 * np.abs(x)):
+            break
+    return np.asarray(x)
