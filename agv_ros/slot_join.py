@@ -6,6 +6,9 @@ the receiver holds behind the channel; the receiver acts on the verdict once it 
 node computes depends on stamps alone, never on the order of arrival. The error detector joins poses with uplink slots,
 the plant in lockstep commands with downlink slots: this join is the barrier that makes the loop deterministic.
 
+Each topic keeps its order, so step 0 parts one run from the next on either side: its message from the messages before
+it, its slot from the slots before it, whichever of the two comes first.
+
 No clock, no thread, no ROS in here: messages go in, pairs that are complete come out.
 """
 
@@ -37,6 +40,10 @@ class Joined(Generic[M]):
     message: M | None
 
 
+MOST_WAITING = 1000
+"""Messages and slots that wait for each other at most, as many as the queue of a topic holds."""
+
+
 class SlotJoin(Generic[M]):
     """Holds messages and slots until they fit together.
 
@@ -50,12 +57,16 @@ class SlotJoin(Generic[M]):
         self._held: M | None = None
         self._settled_ns = 0
         self._last_slot_ns = 0
+        self._is_ahead = False  # the messages have begun a run whose slot 0 is still to come
         self.outdated = 0
         self.unanswered = 0
 
     def add_message(self, message: M) -> list[Joined[M]]:
         """Take a message; returns the slots that were waiting for it, oldest first."""
-        if message.stamp_ns < self._settled_ns and message.stamp_ns != self._start_ns:
+        if message.stamp_ns == self._start_ns:
+            self._arrived.clear()
+            self._is_ahead = all(slot.stamp_ns != self._start_ns for slot in self._waiting)
+        elif message.stamp_ns < self._settled_ns and not self._is_ahead:
             self.outdated += 1
             return []
         self._arrived[message.stamp_ns] = message
@@ -78,19 +89,31 @@ class SlotJoin(Generic[M]):
 
     def _restart(self) -> None:
         """Step 0 begins a run: nothing of a run before it is held."""
-        self._held, self._settled_ns, self._last_slot_ns = None, 0, 0
+        if (self._last_slot_ns or self._waiting) and not self._is_ahead:
+            self._arrived = {ns: message for ns, message in self._arrived.items() if ns == self._start_ns}
+        self._held, self._settled_ns, self._last_slot_ns, self._is_ahead = None, 0, 0, False
         self._waiting.clear()
-        self._arrived = {ns: message for ns, message in self._arrived.items() if ns == self._start_ns}
 
     def _complete(self) -> list[Joined[M]]:
         done: list[Joined[M]] = []
-        while True:
-            ready = [i for i, slot in enumerate(self._waiting) if self._is_here(slot.freshest_ns)]
-            if not ready:
-                return done
-            self.unanswered += ready[0]
-            done.append(self._settle(self._waiting[ready[0]]))
-            del self._waiting[: ready[0] + 1]
+        while (ready := self._first_ready()) is not None:
+            self.unanswered += ready
+            done.append(self._settle(self._waiting[ready]))
+            del self._waiting[: ready + 1]
+        self._forget_what_waits_in_vain()
+        return done
+
+    def _first_ready(self) -> int | None:
+        return next((i for i, slot in enumerate(self._waiting) if self._is_here(slot.freshest_ns)), None)
+
+    def _forget_what_waits_in_vain(self) -> None:
+        """Where one of the two topics is dead, the other must not fill the memory."""
+        while len(self._waiting) > MOST_WAITING:
+            del self._waiting[0]
+            self.unanswered += 1
+        while len(self._arrived) > MOST_WAITING:
+            del self._arrived[next(iter(self._arrived))]
+            self.outdated += 1
 
     def _is_here(self, stamp_ns: int) -> bool:
         return stamp_ns == self._settled_ns or stamp_ns in self._arrived
