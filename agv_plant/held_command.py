@@ -8,26 +8,33 @@ from agv_ros.wire import Command
 class HeldCommand:
     """Zero-order hold with a limit on age.
 
-    `outdated` counts commands that came after a newer one, `stops` how often the AGV was stopped for want of a command.
+    `outdated` counts commands that are not obeyed for their stamp: they came after a newer one, or are from the future
+    and would be obeyed until it is past. `stops` counts how often the AGV was stopped for want of a command.
     """
 
     def __init__(self, timeout_ns: int) -> None:
         self._timeout_ns = timeout_ns
         self._newest: Command | None = None
+        self._now_ns: int | None = None
         self._stopped = False
         self.outdated = 0
         self.stops = 0
 
     def offer(self, command: Command) -> None:
-        """Take a command; one that is older than the newest is not obeyed."""
-        if self._newest is not None and command.stamp_ns < self._newest.stamp_ns:
+        """Take a command; one that is older than the newest, or newer than the last instant, is not obeyed."""
+        is_early = self._now_ns is not None and command.stamp_ns > self._now_ns
+        if is_early or (self._newest is not None and command.stamp_ns < self._newest.stamp_ns):
             self.outdated += 1
             return
         self._newest = command
 
     def at(self, stamp_ns: int) -> Command:
         """The command to obey at an instant: standing still before the first and beyond the limit on age."""
+        self._now_ns = stamp_ns
         newest = self._newest
+        if newest is not None and newest.stamp_ns > stamp_ns:  # offered before the first instant was known
+            self._newest = newest = None
+            self.outdated += 1
         if newest is None:
             return Command(stamp_ns, 0.0, 0.0)
         too_old = stamp_ns - newest.stamp_ns > self._timeout_ns
