@@ -52,21 +52,25 @@ class Grid(NamedTuple):
 MAX_LEAP = 1_000_000
 """Most steps between two messages of a run that are believed: 83 minutes at 5 ms."""
 
+MAX_FIRST = 100_000_000
+"""Latest step at which a node may join a running loop: 5.8 days at 5 ms."""
+
 
 class Steps:
     """Steps of a running loop: as `Grid.step`, but one wild stamp cannot send a node far into the future."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
-        self._last = 0
+        self._last: int | None = None
 
     def of(self, stamp_ns: int) -> int:
         """Step of a stamp. Raises OffGridError for no sampling instant, or one MAX_LEAP steps past the last."""
         k = self._grid.step(stamp_ns)
-        if k > self._last + MAX_LEAP:
+        latest = MAX_FIRST if self._last is None else self._last + MAX_LEAP
+        if k > latest:
             raise OffGridError(
-                f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, {k - self._last} steps after the last one seen; "
-                f"at most {MAX_LEAP} are believed"
+                f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, the last one seen was {self._last}; "
+                f"steps up to {latest} are believed: do all nodes have the same start_time?"
             )
         self._last = k
         return k
