@@ -22,5 +22,5 @@ def control_law(
 
 
 def limit_speed(v: float, v_max: float) -> float:
-    """`v` limited to |v| <= v_max [m/s], in both directions; inf: no limit."""
-    return max(-v_max, min(v, v_max))
+    """`v` limited to |v| <= v_max [m/s], in both directions; inf: no limit. NaN stays NaN."""
+    return min(max(v, -v_max), v_max)
