@@ -17,7 +17,7 @@ J0_FIRST_ZERO = 2.404825557695773
 
 
 def paper(k: int, n: int, ts: float, speed: float) -> Speeds:
-    """The paper's track: a closed oval, 100 m and 18.1 m x 42.5 m for a lap of 100 s; it has a speed of its own.
+    """The paper's track: a closed oval, 100 m and 18.07 m x 42.45 m for a lap of 100 s; it has a speed of its own.
 
     v_r = 1 - 0.5 cos(8 pi k / N),  w_r = (2 pi / T) (1 - cos(4 pi k / N)).
     """
@@ -49,14 +49,21 @@ def eight(k: int, n: int, ts: float, speed: float) -> Speeds:
 def warehouse(k: int, n: int, ts: float, speed: float) -> Speeds:
     """A rectangle with clothoid corners and a full stop in the middle of either long side.
 
-    Both halves of the lap are the same motion, turned by pi against each other, so the lap closes exactly. Half a lap:
-    straight with a stop (40 %), corner (15 %), straight (30 %), corner (15 %). In a corner the curvature rises and
-    falls linearly; sampled at interval midpoints its sum is pi / 2 exactly.
+    Both halves of the lap are the same motion, turned by pi against each other, so the lap closes exactly; a lap of odd
+    N stands still for one step more at its second stop. Half a lap: straight with a stop (40 %), corner (15 %),
+    straight (30 %), corner (15 %). In a corner the curvature rises and falls linearly; sampled at interval midpoints
+    its sum is pi / 2 exactly.
     """
     half = n // 2
-    corner = 2 * (3 * half // 40)
+    corner = 2 * max(1, 3 * half // 40)
     aisle = 4 * half // 10
-    j = k % half
+    j = k % n
+    if j >= half:
+        j -= half
+        if n % 2 == 1 and j >= aisle // 2:
+            if j == aisle // 2:
+                return 0.0, 0.0
+            j -= 1
     if j < aisle:
         return speed * _stop_and_go((j + 0.5) / aisle), 0.0
     if j < aisle + corner:
