@@ -43,25 +43,44 @@ def lap_steps(parameters: ErrorDetectorParameters) -> int:
     return round(parameters.lap_time / parameters.ts)
 
 
+_BLOCK = 256
+_KEPT_BLOCKS = 64
+
+
 class Reference:
-    """X_r by step; computed as far as it was asked for, and kept."""
+    """X_r by step, in whatever order it is asked for, in little memory however long the run.
+
+    Where each block of steps begins is kept, and the points of the last 64 blocks that were computed.
+    """
 
     def __init__(self, parameters: ErrorDetectorParameters) -> None:
         self._speeds = speeds_of(parameters)
         self._ts = parameters.ts
-        self._points = [ReferencePoint(*parameters.track_start, *self._speeds(0))]
+        self._begins = [parameters.track_start]
+        self._blocks: dict[int, list[ReferencePoint]] = {}
 
     def __getitem__(self, k: int) -> ReferencePoint:
         """The reference at step k >= 0."""
-        points = self._points
-        while len(points) <= k:
-            last = points[-1]
-            posture = euler_step(last.x, last.y, last.theta, last.v, last.w, self._ts)
-            points.append(ReferencePoint(*posture, *self._speeds(len(points))))
-        return points[k]
+        return self._block(k // _BLOCK)[k % _BLOCK]
 
     def first(self, steps: int) -> NDArray[np.float64]:
         """The steps 0 .. steps - 1 as an array, shape (steps, 5), columns x, y, theta, v, w."""
-        if steps:
-            self[steps - 1]
-        return np.array(self._points[:steps], dtype=np.float64).reshape(-1, 5)
+        return np.array([self[k] for k in range(steps)], dtype=np.float64).reshape(-1, 5)
+
+    def _block(self, number: int) -> list[ReferencePoint]:
+        while number not in self._blocks:
+            self._integrate(min(number, len(self._begins) - 1))
+        return self._blocks[number]
+
+    def _integrate(self, number: int) -> None:
+        """Compute a block, and with it where the next one begins."""
+        points, posture = [], self._begins[number]
+        for k in range(number * _BLOCK, (number + 1) * _BLOCK):
+            speeds = self._speeds(k)
+            points.append(ReferencePoint(*posture, *speeds))
+            posture = euler_step(*posture, *speeds, self._ts)
+        if len(self._blocks) == _KEPT_BLOCKS:
+            del self._blocks[next(iter(self._blocks))]
+        self._blocks[number] = points
+        if number + 1 == len(self._begins):
+            self._begins.append(posture)
