@@ -15,6 +15,10 @@ class TrackFileError(UserError):
     """A track file that cannot be used; the text names file, line and reason."""
 
 
+_SAME_INSTANT = 1e-9
+"""Instants are whole nanoseconds; k T_s [s] may miss the file's decimal number by a rounding."""
+
+
 class SpeedProfile:
     """Speeds over time, linear between the rows of the file, zero after the last."""
 
@@ -27,7 +31,7 @@ class SpeedProfile:
         after = bisect.bisect_right(self._times, t)
         if after == len(self._rows):
             last = self._rows[-1]
-            return (last[1], last[2]) if t == last[0] else (0.0, 0.0)
+            return (last[1], last[2]) if t - last[0] < _SAME_INSTANT else (0.0, 0.0)
         (t0, v0, w0), (t1, v1, w1) = self._rows[after - 1], self._rows[after]
         share = (t - t0) / (t1 - t0)
         return v0 + share * (v1 - v0), w0 + share * (w1 - w0)
@@ -77,7 +81,7 @@ def _row(
 def load_track(path: str) -> SpeedProfile:
     """Speed profile from a CSV file. Raises TrackFileError."""
     try:
-        with open(path, encoding="utf-8", newline="") as file:
+        with open(path, encoding="utf-8-sig", newline="") as file:
             return parse_track(file, path)
     except OSError as error:
         raise TrackFileError(f"{path}: cannot be read: {error.strerror}") from None
