@@ -12,13 +12,16 @@ from hypothesis import strategies as st
 
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import STATISTICS, simulate, simulate_batch
-from agv_analysis.simulation.batch import _units
+from agv_analysis.simulation.batch import _Batch
 from agv_analysis.simulation.verdicts import Air
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import losses
 from agv_ros.errors import UserError
 
 OUTAGES = str(Path(__file__).parent.parent / "config" / "outages.yaml")
+
+
+ONE = [load_scenario(OUTAGES)]
 
 
 def scenarios(*gains: float, duration: float = 2.0) -> list[Scenario]:
@@ -65,9 +68,12 @@ def test_seeds_are_columns_and_paired() -> None:
 def test_scenarios_of_different_length_and_track_go_together() -> None:
     short, long = *scenarios(25.0, duration=1.0), *scenarios(25.0, duration=3.0)
     line = load_scenario(OUTAGES, ["error_detector.track=line", "plant.duration=1.0"])
-    table = simulate_batch([short, long, line], [1])
-    assert table["steps"][:, 0].tolist() == [200, 600, 200]
-    assert table["final"][0, 0] != table["final"][2, 0]
+    table = simulate_batch([short, line, long, short, line], [1, 2], workers=1)
+    assert table["steps"].tolist() == [[200, 200], [200, 200], [600, 600], [200, 200], [200, 200]]
+    assert (table[0] == table[3]).all()
+    assert (table[1] == table[4]).all()
+    assert table["final"][0, 0] != table["final"][1, 0]
+    assert table[:1].tobytes() == simulate_batch([short], [1, 2]).tobytes()
 
 
 def test_a_diverged_run_ends_early_and_has_not_settled() -> None:
@@ -104,9 +110,9 @@ def test_what_cannot_be_run_is_refused_before_anything_is() -> None:
         simulate_batch([*scenarios(25.0), endless], [1])
 
 
-@given(rows=st.integers(0, 50), columns=st.integers(0, 20), workers=st.integers(1, 16))
+@given(rows=st.integers(0, 40), columns=st.integers(0, 20), workers=st.integers(1, 16))
 @settings(deadline=None, derandomize=True)
 def test_work_is_parted_without_gap_or_overlap(rows: int, columns: int, workers: int) -> None:
-    parts = [(column, row) for column, part in _units(rows, columns, workers) for row in part]
-    assert sorted(parts) == [(column, row) for column in range(columns) for row in range(rows)]
-    assert len(_units(rows, columns, workers)) >= min(rows * columns, workers)
+    units = _Batch(ONE * rows, range(columns)).units(workers)
+    assert sorted(job for unit in units for job in unit) == [(i, j) for i in range(rows) for j in range(columns)]
+    assert len(units) >= min(rows * columns // 2, workers)

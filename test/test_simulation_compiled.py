@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ import pytest
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.compiled import compiled
-from agv_analysis.simulation.loop import at_rest, history, statistics
+from agv_analysis.simulation.loop import Case, at_rest, history, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 
 ROOT = Path(__file__).parent.parent
@@ -49,13 +48,17 @@ def test_compiled_and_plain_agree_to_the_last_bit(settings: tuple[str, ...]) -> 
     run = simulate(load_scenario(PAPER, [*settings, "plant.duration=20.0"]))
     steps = len(run)
     start, numbers = at_rest(*run.scenario.plant.initial_pose), settings_of(run.scenario)
-    lists: tuple[Any, Any, Any] = (run.reference.tolist(), run.lost.tolist(), run.downlink_lost.tolist())
+    reference = run.reference.tolist()
+    plain = Case(run.lost.tolist(), run.downlink_lost.tolist(), start, numbers)
+    fast = Case(run.lost, run.downlink_lost, start, numbers)
     rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
-    assert history(*lists, start, numbers, rows, n_ul) == steps
+    assert history(reference, plain, rows, n_ul) == steps
     assert rows.tobytes() == np.hstack([run.pose, run.error, run.command]).tobytes()
     assert n_ul.tolist() == run.n_ul.tolist()
-    plain = statistics(*lists, start, numbers)
-    assert plain == compiled(statistics)(run.reference, run.lost, run.downlink_lost, start, numbers)
+    assert statistics(reference, plain) == compiled(statistics)(run.reference, fast)
+    slower = fast._replace(settings=numbers._replace(kx=5.0))
+    both = compiled(statistics_of_two)(run.reference, fast, slower)
+    assert both == (compiled(statistics)(run.reference, fast), compiled(statistics)(run.reference, slower))
 
 
 WITHOUT_NUMBA = """

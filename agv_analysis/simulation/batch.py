@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from itertools import groupby, zip_longest
 from typing import get_type_hints
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.compiled import compiled, numbers
-from agv_analysis.simulation.loop import Statistics, at_rest, statistics
+from agv_analysis.simulation.loop import Case, Statistics, at_rest, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
@@ -23,10 +24,11 @@ STATISTICS = np.dtype([(name, np.dtype(kind)) for name, kind in get_type_hints(S
 """One run's row: the fields of `loop.Statistics`, int64 and float64."""
 
 Table = NDArray[np.void]
-Postures = Callable[[ErrorDetectorParameters, int], NDArray[np.float64]]
+Job = tuple[int, int]
+"""One run: (row, column) of the table, that is, scenario and seed."""
 
-_UNITS_PER_WORKER = 4
-"""Each seed's runs are cut in so many parts that every worker gets at least this many, so that none waits long."""
+_LARGEST_UNIT = 256
+"""Runs that one worker takes at once: enough to share the random numbers of a seed, few enough to tell of progress."""
 
 
 def simulate_batch(
@@ -41,40 +43,17 @@ def simulate_batch(
     scenarios does not count. `workers` threads, one a core by default, do the work; their number changes nothing in the
     result. `progress` is told how many runs are done. Raises UserError if a run has no end.
     """
-    steps = [steps_of(scenario) for scenario in scenarios]
-    workers = workers or cores()
-    table = np.zeros((len(scenarios), len(seeds)), dtype=STATISTICS)
-    postures: Postures = functools.lru_cache(maxsize=16)(lambda detector, n: Reference(detector).first(n))
-
-    def work(column: int, part: range) -> int:
-        airs = functools.cache(functools.partial(Air, seeds[column]))
-        for row in part:
-            table[row, column] = _run(scenarios[row], steps[row], airs(steps[row]), postures)
-        return len(part)
-
-    done = 0
+    batch, workers, done = _Batch(scenarios, seeds), workers or cores(), 0
     with ThreadPoolExecutor(workers) as pool:
         try:
-            units = [pool.submit(work, *unit) for unit in _units(len(scenarios), len(seeds), workers)]
+            units = [pool.submit(batch.work, unit) for unit in batch.units(workers)]
             for unit in as_completed(units):
                 done += unit.result()
                 progress(done)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return table
-
-
-def _run(scenario: Scenario, steps: int, air: Air, postures: Postures) -> Statistics:
-    relay = scenario.relay
-    found: Statistics = compiled(statistics)(
-        numbers(postures(scenario.error_detector, steps)),
-        numbers(air.verdicts(relay.uplink, "uplink")),
-        numbers(air.verdicts(relay.downlink, "downlink")),
-        at_rest(*scenario.plant.initial_pose),
-        settings_of(scenario),
-    )
-    return found
+    return batch.table
 
 
 def cores() -> int:
@@ -82,8 +61,53 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _units(rows: int, columns: int, workers: int) -> list[tuple[int, range]]:
-    """Work in parts: (column, rows of it), at least `_UNITS_PER_WORKER` a worker where there is enough to do."""
-    parts = -(-_UNITS_PER_WORKER * workers // max(1, columns))
-    size = max(1, rows // parts)
-    return [(column, range(rows)[first : first + size]) for column in range(columns) for first in range(0, rows, size)]
+class _Batch:
+    """The table and what is needed to fill it; filled by several threads, each in places of its own."""
+
+    def __init__(self, scenarios: Sequence[Scenario], seeds: Sequence[int]) -> None:
+        self.table: Table = np.zeros((len(scenarios), len(seeds)), dtype=STATISTICS)
+        self._scenarios, self._seeds = scenarios, seeds
+        self._steps = [steps_of(scenario) for scenario in scenarios]
+        tracks: dict[tuple[ErrorDetectorParameters, int], int] = {}
+        kinds = [(scenario.error_detector, steps) for scenario, steps in zip(scenarios, self._steps, strict=True)]
+        self._track = [tracks.setdefault(kind, len(tracks)) for kind in kinds]
+        self._reference = functools.lru_cache(maxsize=16)(
+            lambda row: numbers(Reference(scenarios[row].error_detector).first(self._steps[row]))
+        )
+
+    def units(self, workers: int) -> list[list[Job]]:
+        """All runs in parts, several for each worker so that none waits long for another; seed after seed."""
+        rows, columns = self.table.shape
+        jobs = [(row, column) for column in range(columns) for row in range(rows)]
+        size = max(2, min(_LARGEST_UNIT, len(jobs) // (4 * workers)))
+        return [jobs[first : first + size] for first in range(0, len(jobs), size)]
+
+    def work(self, unit: list[Job]) -> int:
+        """Run one part; returns the number of its runs."""
+        airs = functools.lru_cache(maxsize=4)(Air)
+        for track, jobs in groupby(sorted(unit, key=lambda job: self._track[job[0]]), lambda job: self._track[job[0]]):
+            reference = self._reference(self._track.index(track))
+            for job, found in self._runs(reference, list(jobs), airs):
+                self.table[job] = found
+        return len(unit)
+
+    def _runs(
+        self, reference: NDArray[np.float64], jobs: list[Job], airs: Callable[[int, int], Air]
+    ) -> Iterator[tuple[Job, Statistics]]:
+        """Runs on one reference, two at a time."""
+        for one, other in zip_longest(jobs[::2], jobs[1::2]):
+            if other is None:
+                yield one, compiled(statistics)(reference, self._case(one, airs))
+            else:
+                pair = self._case(one, airs), self._case(other, airs)
+                yield from zip((one, other), compiled(statistics_of_two)(reference, *pair), strict=True)
+
+    def _case(self, job: Job, airs: Callable[[int, int], Air]) -> Case:
+        row, column = job
+        scenario, air = self._scenarios[row], airs(self._seeds[column], self._steps[row])
+        return Case(
+            numbers(air.verdicts(scenario.relay.uplink, "uplink")),
+            numbers(air.verdicts(scenario.relay.downlink, "downlink")),
+            at_rest(*scenario.plant.initial_pose),
+            settings_of(scenario),
+        )

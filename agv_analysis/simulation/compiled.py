@@ -50,10 +50,11 @@ def numbers(array: Any) -> Any:
     return array if HAS_NUMBA else array.tolist()
 
 
-def _compile(function: types.FunctionType, folder: Path | None) -> Callable[..., Any]:
+def _compile(function: types.FunctionType, folder: Path | None, inside: bool = False) -> Callable[..., Any]:
+    """`function` compiled, to be kept in `folder` if there is one, or to be put `inside` each of its callers."""
     import numba
 
-    inner = {name: _compile(called, None) for name, called in _called(function)}
+    inner = {name: _compile(called, None, inside=True) for name, called in _called(function)}
     copy = types.FunctionType(
         function.__code__,
         {**function.__globals__, **inner},
@@ -64,7 +65,7 @@ def _compile(function: types.FunctionType, folder: Path | None) -> Callable[...,
     usual = numba.config.CACHE_DIR
     try:
         numba.config.CACHE_DIR = str(folder or "")  # looked at by the decorator, not later
-        dispatcher: Callable[..., Any] = numba.njit(nogil=True, cache=folder is not None)(copy)
+        dispatcher: Callable[..., Any] = numba.njit(nogil=True, cache=folder is not None, forceinline=inside)(copy)
     finally:
         numba.config.CACHE_DIR = usual
     return dispatcher

@@ -62,38 +62,65 @@ class Answer(NamedTuple):
     w: float
 
 
+class Case(NamedTuple):
+    """One run: the verdicts of its slots, shape (N,), the loop before slot 0 and its settings."""
+
+    lost: Flags
+    downlink_lost: Flags
+    start: Loop
+    settings: Settings
+
+
 def at_rest(x: float, y: float, theta: float) -> Loop:
     """The loop before slot 0 with the AGV at a pose in frame `map` [m, m, rad]."""
     return Loop(x, y, theta, x, y, theta, 0, 0.0, 0.0)
 
 
+# -- one slot ----------------------------------------------------------------------------------------------------------
+
+
+def slot(
+    loop: Loop,
+    x_r: float,
+    y_r: float,
+    theta_r: float,
+    v_r: float,
+    w_r: float,
+    lost: bool,
+    downlink_lost: bool,
+    settings: Settings,
+) -> tuple[Loop, Answer]:
+    """From one pose to the next, under the verdicts of both links and with the reference at this step."""
+    x, y, theta, v, w = loop.x, loop.y, loop.theta, loop.v, loop.w
+    if lost:
+        held = Loop(x, y, theta, loop.x_held, loop.y_held, loop.theta_held, loop.n_ul + 1, v, w)
+        sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
+        return obey(held, sent, downlink_lost, settings), sent
+    # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
+    held = Loop(x, y, theta, x, y, theta, 0, v, w)
+    sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
+    return obey(held, sent, downlink_lost, settings), sent
+
+
 def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings) -> Answer:
-    """The edge's answer to a slot, from the pose that it holds and the reference at this step.
+    """The edge's answer, from the pose that it holds.
 
     An error beyond the range of numbers is refused by the controller, as it comes in from the wire.
     """
     x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, loop.x_held, loop.y_held, loop.theta_held)
-    if not (math.isfinite(x_e) and math.isfinite(y_e) and math.isfinite(theta_e)):
+    if not are_finite(x_e, y_e, theta_e):
         return Answer(x_e, y_e, theta_e, math.nan, math.nan)
     v, w = control_law(x_e, y_e, theta_e, v_r, w_r, settings.kx, settings.ky, settings.ktheta)
     return Answer(x_e, y_e, theta_e, limit_speed(v, settings.v_max), w)
 
 
-def hear(loop: Loop, lost: bool) -> Loop:
-    """The loop after the uplink's verdict: the edge holds the pose of this step, or an outdated one."""
-    if lost:
-        return Loop(
-            loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.n_ul + 1, loop.v, loop.w
-        )
-    return Loop(loop.x, loop.y, loop.theta, loop.x, loop.y, loop.theta, 0, loop.v, loop.w)
+def obey(loop: Loop, sent: Answer, lost: bool, settings: Settings) -> Loop:
+    """One sampling period of the plant under the freshest command.
 
-
-def obey(loop: Loop, v: float, w: float, lost: bool, settings: Settings) -> Loop:
-    """The loop after the downlink's verdict and one sampling period under the freshest command.
-
-    A command that is not finite is refused by the plant, which goes on with the one before.
+    A command beyond the range of numbers is refused by the plant, which goes on with the one before.
     """
-    if lost or not (math.isfinite(v) and math.isfinite(w)):
+    v, w = sent.v, sent.w
+    if lost or not are_finite(v, w, 0.0):
         v, w = loop.v, loop.w
     if settings.arc:
         x, y, theta = arc_step(loop.x, loop.y, loop.theta, v, w, settings.ts)
@@ -104,41 +131,33 @@ def obey(loop: Loop, v: float, w: float, lost: bool, settings: Settings) -> Loop
 
 def goes_on(loop: Loop, sent: Answer) -> bool:
     """Is there a next slot? Not after a pose beyond the range of numbers, nor if the edge sent no command."""
-    return (
-        math.isfinite(loop.x)
-        and math.isfinite(loop.y)
-        and math.isfinite(loop.theta)
-        and math.isfinite(sent.x_e)
-        and math.isfinite(sent.y_e)
-        and math.isfinite(sent.theta_e)
-    )
+    return are_finite(loop.x, loop.y, loop.theta) and are_finite(sent.x_e, sent.y_e, sent.theta_e)
 
 
-def history(
-    reference: Rows,
-    lost: Flags,
-    downlink_lost: Flags,
-    loop: Loop,
-    settings: Settings,
-    rows: NDArray[np.float64],
-    n_ul: NDArray[np.int64],
-) -> int:
+def are_finite(a: float, b: float, c: float) -> bool:
+    """Are all three finite, and their sum as well? One test instead of three, the third of a slot's time otherwise."""
+    return math.isfinite(a + b + c)
+
+
+# -- whole runs --------------------------------------------------------------------------------------------------------
+
+
+def history(reference: Rows, case: Case, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), its age into n_ul[k], shape (N,).
 
-    `reference` has shape (N, 5), the verdicts (N,). Returns the number of slots until the run ended, N at most.
+    `reference` has shape (N, 5). Returns the number of slots until the run ended, N at most.
     """
-    for k in range(len(lost)):
-        target = reference[k]
-        loop = hear(loop, lost[k])
-        sent = answer(loop, target[0], target[1], target[2], target[3], target[4], settings)
+    loop = case.start
+    for k in range(len(case.lost)):
+        x_r, y_r, theta_r, v_r, w_r = reference[k]
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
+        loop, sent = slot(loop, x_r, y_r, theta_r, v_r, w_r, case.lost[k], case.downlink_lost[k], case.settings)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
         n_ul[k] = loop.n_ul
-        loop = obey(loop, sent.v, sent.w, downlink_lost[k], settings)
         if not goes_on(loop, sent):
             return k + 1
-    return len(lost)
+    return len(case.lost)
 
 
 class Statistics(NamedTuple):
@@ -157,47 +176,111 @@ class Statistics(NamedTuple):
     peak: float
     final: float
     position_peak: float
-    """Largest distance between AGV and reference [m]."""
+    """Largest distance between AGV and reference [m]; inf where its square is."""
     position_final: float
     n_ul_max: int
     n_ul_mean: float
 
 
-def statistics(reference: Rows, lost: Flags, downlink_lost: Flags, loop: Loop, settings: Settings) -> Statistics:
-    """One run of which only the metrics are kept; arguments as those of `history`."""
-    initial = reference[0][1] - loop.y
-    band, started = SHARE * abs(initial), abs(initial) > NEGLIGIBLE
-    outside_1cm, outside_2pct, steps, n_ul_max, n_ul_sum = -1, -1, 0, 0, 0
-    overshoot, iae, ise, peak, e, distance, farthest = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(len(lost)):
-        target = reference[k]
-        e = target[1] - loop.y
-        size, distance = abs(e), math.hypot(target[0] - loop.x, e)
-        if not size < TOLERANCE:
-            outside_1cm = k
-        if not size < band:
-            outside_2pct = k
-        overshoot = max(overshoot, -e if initial > 0.0 else e)
-        iae, ise = iae + size, ise + e * e
-        peak, farthest = max(peak, size), max(farthest, distance)
-        loop = hear(loop, lost[k])
-        n_ul_max, n_ul_sum = max(n_ul_max, loop.n_ul), n_ul_sum + loop.n_ul
-        sent = answer(loop, target[0], target[1], target[2], target[3], target[4], settings)
-        loop = obey(loop, sent.v, sent.w, downlink_lost[k], settings)
-        steps = k + 1
-        if not goes_on(loop, sent):
-            break
-    return Statistics(
-        steps,
-        outside_1cm + 1 if outside_1cm + 1 < steps else -1,
-        outside_2pct + 1 if started and outside_2pct + 1 < steps else -1,
-        overshoot / abs(initial) if started else math.nan,
-        iae * settings.ts,
-        ise * settings.ts,
-        peak,
+class Drive(NamedTuple):
+    """A run on its way, with what has been seen of its error so far."""
+
+    loop: Loop
+    goes_on: bool
+    steps: int
+    outside_1cm: int
+    """Last step outside the band, -1 if there was none."""
+    outside_2pct: int
+    band_2pct: float
+    lowest: float
+    highest: float
+    e: float
+    iae: float
+    ise: float
+    square: float
+    """Distance between AGV and reference, squared [m^2]."""
+    farthest: float
+    n_ul_max: int
+    n_ul_sum: int
+
+
+def begin(reference: Rows, case: Case) -> Drive:
+    """A run before slot 0."""
+    band = SHARE * abs(reference[0][1] - case.start.y)
+    return Drive(case.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
+
+
+def proceed(
+    run: Drive, k: int, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, lost: bool,
+    downlink_lost: bool, settings: Settings,
+) -> Drive:  # fmt: skip
+    """The run after slot k."""
+    dx, e = x_r - run.loop.x, y_r - run.loop.y
+    loop, sent = slot(run.loop, x_r, y_r, theta_r, v_r, w_r, lost, downlink_lost, settings)
+    size, square = abs(e), dx * dx + e * e
+    return Drive(
+        loop,
+        goes_on(loop, sent),
+        k + 1,
+        run.outside_1cm if size < TOLERANCE else k,
+        run.outside_2pct if size < run.band_2pct else k,
+        run.band_2pct,
+        min(run.lowest, e),
+        max(run.highest, e),
         e,
-        farthest,
-        distance,
-        n_ul_max,
-        n_ul_sum / steps,
+        run.iae + size,
+        run.ise + e * e,
+        square,
+        max(run.farthest, square),
+        max(run.n_ul_max, loop.n_ul),
+        run.n_ul_sum + loop.n_ul,
     )
+
+
+def end(run: Drive, initial: float, ts: float) -> Statistics:
+    """The metrics of a run of at least one slot, from the error [m] that it began with."""
+    started = abs(initial) > NEGLIGIBLE
+    beyond = -run.lowest if initial > 0.0 else run.highest
+    return Statistics(
+        run.steps,
+        run.outside_1cm + 1 if run.outside_1cm + 1 < run.steps else -1,
+        run.outside_2pct + 1 if started and run.outside_2pct + 1 < run.steps else -1,
+        max(0.0, beyond) / abs(initial) if started else math.nan,
+        run.iae * ts,
+        run.ise * ts,
+        max(-run.lowest, run.highest),
+        run.e,
+        math.sqrt(run.farthest),
+        math.sqrt(run.square),
+        run.n_ul_max,
+        run.n_ul_sum / run.steps,
+    )
+
+
+def statistics(reference: Rows, case: Case) -> Statistics:
+    """One run of which only the metrics are kept; `reference` has shape (N, 5)."""
+    run = begin(reference, case)
+    for k in range(len(case.lost)):
+        x_r, y_r, theta_r, v_r, w_r = reference[k]
+        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, case.lost[k], case.downlink_lost[k], case.settings)
+        if not run.goes_on:
+            break
+    return end(run, reference[0][1] - case.start.y, case.settings.ts)
+
+
+def statistics_of_two(reference: Rows, one: Case, other: Case) -> tuple[Statistics, Statistics]:
+    """Two runs on one reference, as `statistics`; together they take little longer than one.
+
+    A run is a chain in which everything waits for a sine of what came before; meanwhile the core works on the other.
+    """
+    first, second = begin(reference, one), begin(reference, other)
+    for k in range(len(one.lost)):
+        x_r, y_r, theta_r, v_r, w_r = reference[k]
+        if first.goes_on:
+            first = proceed(first, k, x_r, y_r, theta_r, v_r, w_r, one.lost[k], one.downlink_lost[k], one.settings)
+        if second.goes_on:
+            second = proceed(
+                second, k, x_r, y_r, theta_r, v_r, w_r, other.lost[k], other.downlink_lost[k], other.settings
+            )
+    y_r = reference[0][1]
+    return end(first, y_r - one.start.y, one.settings.ts), end(second, y_r - other.start.y, other.settings.ts)

@@ -9,7 +9,7 @@ import numpy as np
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.compiled import compiled, numbers
-from agv_analysis.simulation.loop import Settings, at_rest, history
+from agv_analysis.simulation.loop import Case, Settings, at_rest, history
 from agv_cloud.reference import Reference
 from agv_plant.radio import losses
 from agv_ros.errors import UserError
@@ -26,10 +26,10 @@ def simulate(scenario: Scenario) -> Run:
     lost = losses(relay.uplink, relay.seed, "uplink", steps)
     downlink_lost = losses(relay.downlink, relay.seed, "downlink", steps)
     rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
+    start, settings = at_rest(*scenario.plant.initial_pose), settings_of(scenario)
     done = compiled(history)(
-        numbers(reference), numbers(lost), numbers(downlink_lost), at_rest(*scenario.plant.initial_pose),
-        settings_of(scenario), rows, n_ul,
-    )  # fmt: skip
+        numbers(reference), Case(numbers(lost), numbers(downlink_lost), start, settings), rows, n_ul
+    )
     return Run(
         scenario=scenario,
         k=np.arange(done),
