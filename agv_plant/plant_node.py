@@ -132,7 +132,8 @@ class PlantNode(LoopNode[PlantParameters]):
     def _answer(self, ready: list[Joined[Command]]) -> None:
         for joined in ready:
             stamp_ns = joined.slot.stamp_ns
-            if stamp_ns == self.grid.stamp(self.k) and not self.finished:
+            asked = self._pose_out.count > 0  # what came before the first pose answers another run's
+            if asked and stamp_ns == self.grid.stamp(self.k) and not self.finished:
                 self._advance(joined.message or Command(stamp_ns, 0.0, 0.0))
 
     def _watch_for_answers(self) -> None:

@@ -1,0 +1,120 @@
+"""What tests share: a DDS domain of their own, and runs of the loop on real DDS, recorded to real bags."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from agv_analysis.run import Run
+
+REPOSITORY = Path(__file__).parents[1]
+DOMAINS = range(1, 102)  # those that Linux' ephemeral ports leave free
+FIRST_PORT = 41000
+
+
+def _claim_domain() -> tuple[int, socket.socket]:
+    """A DDS domain that no other test process has, held for as long as the socket is open."""
+    begin = os.getpid()
+    for offset in DOMAINS:
+        domain = DOMAINS[(begin + offset) % len(DOMAINS)]
+        claim = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            claim.bind(("127.0.0.1", FIRST_PORT + domain))
+        except OSError:
+            claim.close()
+        else:
+            return domain, claim
+    raise RuntimeError("every DDS domain is taken by another test process")
+
+
+# Set before any test imports rclpy: a context takes its domain from here, and so do the processes that tests start.
+_domain, _claim = _claim_domain()
+os.environ["ROS_DOMAIN_ID"] = str(_domain)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+os.environ["PYTHONUNBUFFERED"] = "1"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _ros_home(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Logs of nodes go where the tests' other files go."""
+    os.environ["ROS_HOME"] = str(tmp_path_factory.mktemp("ros_home"))
+
+
+Drive = Callable[..., "Run"]
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Drive:
+    """Run a params file of config/ with settings on DDS, record it, and give the run that its bag holds."""
+
+    def run(*settings: str, config: str = "paper", executor: str = "events", bag: Path | None = None) -> Run:
+        from agv_analysis.recording import read_run
+        from agv_analysis.runner import run_in_process
+        from agv_analysis.scenario import load_scenario
+
+        where = tmp_path / "bag" if bag is None else bag
+        scenario = load_scenario(str(REPOSITORY / "config" / f"{config}.yaml"), settings)
+        outcome = run_in_process(scenario, where, lambda _: None, executor)
+        assert (outcome.failure, outcome.recording_failure) == ("", "")
+        return read_run(where)
+
+    return run
+
+
+class Started:
+    """A process of the project that a test has started."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self.process = process
+        self.lines: list[str] = []
+
+    def wait_for(self, text: str) -> str:
+        """Read on until a line holds `text`; fails the test if the process ends before."""
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.append(line.rstrip("\n"))
+            if text in line:
+                return self.lines[-1]
+        pytest.fail(f"ended without a line with {text!r}:\n" + "\n".join(self.lines))
+
+    def end(self, seconds: float = 60.0) -> tuple[int, str]:
+        """Exit status and all that was said; `seconds` is only there so that a hanging test ends."""
+        rest, _ = self.process.communicate(timeout=seconds)
+        return self.process.returncode, "\n".join([*self.lines, *rest.splitlines()])
+
+
+Start = Callable[..., Started]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start a module of the project or an executable in a process of its own; it is ended with the test."""
+    started: list[Started] = []
+
+    def run(*command: str, **options: Any) -> Started:
+        arguments = list(command) if command[0].startswith("/") else [sys.executable, "-m", *command]
+        process = subprocess.Popen(
+            arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=REPOSITORY, **options
+        )
+        started.append(Started(process))
+        return started[-1]
+
+    yield run
+    for child in started:
+        if child.process.poll() is None:
+            child.process.terminate()
+        child.process.communicate(timeout=30.0)
+
+
+@pytest.fixture
+def agv_ncs(start: Start) -> Callable[..., tuple[int, str]]:
+    """Run a command of `agv-ncs` to its end: exit status and output."""
+    return lambda *arguments, **options: start("agv_analysis.cli", *map(str, arguments), **options).end(300.0)

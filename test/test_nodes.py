@@ -1,0 +1,341 @@
+"""Single nodes on real DDS: parameters, bad messages, signals, missing peers, real time."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import TimeReference
+
+from agv_cloud.controller_node import ControllerNode
+from agv_cloud.error_detector_node import ErrorDetectorNode
+from agv_plant.plant_node import PlantNode
+from agv_plant.relay_node import RelayNode
+from agv_ros.errors import UserError
+from agv_ros.executor import EXECUTORS, spin_for
+from agv_ros.node import LOOP_QOS, LoopNode
+
+if TYPE_CHECKING:
+    from conftest import Start
+
+NODES: dict[str, type[LoopNode[Any]]] = {
+    "agv_plant.plant_node": PlantNode,
+    "agv_plant.relay_node": RelayNode,
+    "agv_cloud.error_detector_node": ErrorDetectorNode,
+    "agv_cloud.controller_node": ControllerNode,
+}
+
+
+class Bench:
+    """Nodes under test and a probe beside them, in a context and an executor of their own."""
+
+    def __init__(self, executor: str) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.executor = EXECUTORS[executor](context=self.context)
+        self.probe = Node("probe", context=self.context, use_global_arguments=False)
+        self.executor.add_node(self.probe)
+        self.nodes: list[Node] = [self.probe]
+
+    def add(self, kind: type[LoopNode[Any]], **parameters: Any) -> Any:
+        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
+        node = kind(parameter_overrides=overrides, context=self.context, use_global_arguments=False)
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Run callbacks until the condition holds; a minute is only there so that a hanging test ends."""
+        assert spin_for(self.executor, condition, 60.0)
+
+    def call(self, kind: Any, name: str, request: Any) -> Any:
+        client = self.probe.create_client(kind, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(request)
+        self.until(future.done)
+        return future.result()
+
+    def publisher(self, kind: Any, topic: str) -> Any:
+        publisher = self.probe.create_publisher(kind, topic, LOOP_QOS)
+        self.until(lambda: publisher.get_subscription_count() > 0)
+        return publisher
+
+    def received(self, kind: Any, topic: str) -> list[Any]:
+        messages: list[Any] = []
+        self.probe.create_subscription(kind, topic, messages.append, LOOP_QOS)
+        self.until(lambda: self.probe.count_publishers(topic) > 0)
+        return messages
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture(params=["events", "single"])
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    made = Bench(request.param)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def lone_bench() -> Iterator[Bench]:
+    made = Bench("single")
+    yield made
+    made.close()
+
+
+# -- parameters -------------------------------------------------------------------------------------------------------
+
+
+def set_parameter(bench: Bench, node: str, name: str, value: Any) -> Any:
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    return bench.call(SetParameters, f"/{node}/set_parameters", request).results[0]
+
+
+def test_gains_change_while_the_controller_runs(bench: Bench) -> None:
+    controller = bench.add(ControllerNode)
+    assert set_parameter(bench, "controller", "kx", 7.5).successful
+    assert controller.settings.kx == 7.5
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("kx", -1.0, "kx out of range Min: 0.0, Max: 1000000.0"),
+        ("kx", math.inf, "kx out of range Min: 0.0, Max: 1000000.0"),
+        ("v_max", math.nan, "v_max out of range Min: 0.0, Max: inf, value: nan"),
+        ("v_max", 0.0, "controller.v_max must be in (0, inf], got 0.0"),
+        ("kx", 25, "DOUBLE"),
+        ("ts", 0.01, "read-only"),
+    ],
+)
+def test_a_refused_value_is_refused_with_the_reason_and_changes_nothing(
+    bench: Bench, name: str, value: Any, reason: str
+) -> None:
+    controller = bench.add(ControllerNode)
+    before = controller.settings
+    result = set_parameter(bench, "controller", name, value)
+    assert not result.successful
+    assert reason in result.reason
+    assert controller.settings == before
+
+
+def test_loss_parameters_change_while_the_relay_runs(bench: Bench) -> None:
+    relay = bench.add(RelayNode, uplink__model="bernoulli")
+    assert set_parameter(bench, "relay", "uplink.p", 1.0).successful
+    assert not set_parameter(bench, "relay", "uplink.p", 1.5).successful
+    poses, slots = bench.publisher(PoseStamped, "agv/pose"), bench.received(TimeReference, "edge/slot")
+    for k in range(2):
+        poses.publish(pose(k))
+    bench.until(lambda: len(slots) == 2)
+    assert [slot.source for slot in slots] == ["delivered", "lost"]  # slot 0 never is
+    assert relay.settings.uplink.p == 1.0
+
+
+def test_parameters_are_described_with_unit_and_range(bench: Bench) -> None:
+    bench.add(ControllerNode)
+    request = DescribeParameters.Request(names=["kx", "v_max"])
+    kx, v_max = bench.call(DescribeParameters, "/controller/describe_parameters", request).descriptors
+    assert "[1/s]" in kx.description
+    assert (kx.floating_point_range[0].from_value, kx.floating_point_range[0].to_value) == (0.0, 1e6)
+    assert "(0, inf]" in v_max.additional_constraints
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "names"),
+    [
+        (PlantNode, {"ts": -0.005}, ["plant.ts", "-0.005", "[1e-06, 10]"]),
+        (PlantNode, {"ts": math.nan}, ["plant.ts", "nan"]),
+        (PlantNode, {"initial_pose": [0.0, 1.0]}, ["plant.initial_pose", "3 finite numbers"]),
+        (RelayNode, {"uplink__model": "carrier_pigeon"}, ["relay.uplink.model", "carrier_pigeon", "gilbert_elliott"]),
+        (RelayNode, {"uplink__p": 1.5}, ["relay.uplink.p", "1.5", "[0, 1]"]),
+        (ErrorDetectorNode, {"track": "moebius"}, ["error_detector.track", "moebius", "warehouse"]),
+        (ErrorDetectorNode, {"track": "csv", "track_file": "/no/such.csv"}, ["/no/such.csv"]),
+        (ControllerNode, {"kx": math.inf}, ["controller.kx", "inf"]),
+        (ControllerNode, {"kx": 25}, ["controller.kx", "25.0"]),
+        (ControllerNode, {"kx": "fast"}, ["controller.kx", "fast"]),
+    ],
+)
+def test_a_wrong_parameter_stops_the_node_from_being_made(
+    lone_bench: Bench, kind: type[LoopNode[Any]], parameters: dict[str, Any], names: list[str]
+) -> None:
+    with pytest.raises(UserError) as refused:
+        lone_bench.add(kind, **parameters)
+    for name in names:
+        assert name in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_qos_can_be_overridden(bench: Bench) -> None:
+    bench.add(
+        ControllerNode,
+        **{"qos_overrides.__edge__cmd_vel.publisher.reliability".replace("__", "/"): "best_effort"},
+    )
+    bench.until(lambda: bench.probe.count_publishers("edge/cmd_vel") == 1)
+    info = bench.probe.get_publishers_info_by_topic("edge/cmd_vel")[0]
+    assert info.qos_profile.reliability.short_key == "best_effort"
+
+
+# -- messages ---------------------------------------------------------------------------------------------------------
+
+
+def pose(k: int, x: float = 0.0, y: float = 0.0) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id = "map"
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(1_000_000_000 + 5_000_000 * k, 1_000_000_000)
+    message.pose.position.x, message.pose.position.y = x, y
+    message.pose.orientation.w = 1.0
+    return message
+
+
+def rejected(diagnostics: list[Any], node: str, topic: str) -> int:
+    """How many messages of a topic the node says that it rejected."""
+    counts = [
+        int(value.value)
+        for message in diagnostics
+        for status in message.status
+        for value in status.values
+        if status.name == node and value.key == f"rejected {topic}"
+    ]
+    return max(counts, default=0)
+
+
+def test_a_nan_pose_is_rejected_and_counted_and_the_loop_goes_on(bench: Bench) -> None:
+    bench.add(RelayNode)
+    bench.add(ErrorDetectorNode, track="line", track_start=[0.0, 0.0, 0.0])
+    errors, diagnostics = bench.received(Odometry, "edge/error"), bench.received(DiagnosticArray, "/diagnostics")
+    poses = bench.publisher(PoseStamped, "agv/pose")
+    bench.until(lambda: bench.probe.count_subscribers("edge/pose") + bench.probe.count_subscribers("edge/slot") == 2)
+    poses.publish(pose(0, x=-1.0))
+    poses.publish(pose(1, x=math.nan))
+    poses.publish(pose(2, x=-3.0))
+    bench.until(lambda: len(errors) == 3)
+    # The line runs at 1 m/s: 5 mm a step. Step 1 is answered from the pose of step 0, the last good one.
+    assert [error.pose.pose.position.x for error in errors] == pytest.approx([1.0, 1.005, 3.01])
+    bench.until(lambda: rejected(diagnostics, "error_detector", "edge/pose") == 1)
+
+
+def test_a_nan_error_is_rejected_by_the_controller(bench: Bench) -> None:
+    controller = bench.add(ControllerNode)
+    commands = bench.received(TwistStamped, "edge/cmd_vel")
+    errors = bench.publisher(Odometry, "edge/error")
+    for x in (math.nan, 2.0):
+        message = Odometry()
+        message.header.stamp.sec = 1
+        message.pose.pose.position.x, message.pose.pose.orientation.w = x, 1.0
+        errors.publish(message)
+    bench.until(lambda: len(commands) == 1)
+    assert commands[0].twist.linear.x == 50.0
+    assert controller.rejected == {"edge/error": 1}
+
+
+def test_a_nan_command_is_rejected_and_the_agv_keeps_the_last_good_one(bench: Bench) -> None:
+    plant = bench.add(PlantNode, initial_pose=[0.0, 0.0, 0.0], duration=0.02)
+    poses = bench.received(PoseStamped, "agv/pose")
+    commands, slots = bench.publisher(TwistStamped, "agv/cmd_vel"), bench.publisher(TimeReference, "agv/slot")
+    for k, v in enumerate((2.0, math.nan, 1.0)):
+        bench.until(lambda k=k: len(poses) == k + 1)
+        command, slot = TwistStamped(), TimeReference()
+        command.header.stamp = slot.header.stamp = slot.time_ref = pose(k).header.stamp
+        command.twist.linear.x, slot.source = v, "delivered"
+        commands.publish(command)
+        slots.publish(slot)
+    bench.until(lambda: len(poses) == 4)
+    assert [message.pose.position.x for message in poses] == pytest.approx([0.0, 0.01, 0.02, 0.025])
+    assert plant.rejected == {"agv/cmd_vel": 1}
+
+
+def test_stamps_off_the_grid_are_rejected(bench: Bench) -> None:
+    relay = bench.add(RelayNode)
+    slots, poses = bench.received(TimeReference, "edge/slot"), bench.publisher(PoseStamped, "agv/pose")
+    wrong = pose(1)
+    wrong.header.stamp.nanosec += 1
+    poses.publish(wrong)
+    poses.publish(pose(2))
+    bench.until(lambda: len(slots) == 1)
+    assert relay.rejected == {"agv/pose": 1}
+
+
+# -- real time --------------------------------------------------------------------------------------------------------
+
+
+def test_in_real_time_the_agv_stops_without_commands_and_goes_on_when_they_return(bench: Bench) -> None:
+    plant = bench.add(
+        PlantNode, clock="realtime", ts=0.01, cmd_vel_timeout=0.1, duration=math.inf, initial_pose=[0.0, 0.0, 0.0]
+    )
+    commands = bench.publisher(TwistStamped, "agv/cmd_vel")
+    bench.until(lambda: plant.k > 20)
+    assert plant.state.x == 0.0  # it stands still before the first command
+
+    def drive() -> None:
+        command = TwistStamped()
+        stamp_ns = plant.grid.stamp(plant.k)
+        command.header.stamp.sec, command.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        command.twist.linear.x = 1.0
+        commands.publish(command)
+
+    drive()
+    bench.until(lambda: plant.facts()["stops without command"] == "1")
+    stopped_at = plant.state.x
+    assert stopped_at == pytest.approx(0.1, abs=0.0201)  # for the 100 ms of the timeout, at 1 m/s
+    k = plant.k
+    bench.until(lambda: plant.k > k + 20)
+    assert plant.state.x == stopped_at
+    drive()
+    bench.until(lambda: plant.state.x > stopped_at)
+    assert int(float(plant.facts()["missed deadlines"])) >= 0
+    assert float(plant.facts()["jitter max"]) >= float(plant.facts()["jitter p50"]) >= 0.0
+
+
+# -- processes --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("module", [*NODES, "agv_analysis.recorder_node"])
+def test_a_waiting_node_ends_cleanly_on_signals(
+    start: Start, lone_bench: Bench, tmp_path: Path, module: str, number: int
+) -> None:
+    parameters = ["-p", "answer_timeout:=60.0", "-p", "wait_for_subscribers:=5", "-p", f"bag:={tmp_path / 'bag'}"]
+    node = start(module, "--ros-args", *parameters)
+    lone_bench.until(lambda: lone_bench.probe.count_publishers("/diagnostics") == 1)
+    node.process.send_signal(number)
+    status, said = node.end()
+    assert status == 0
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("running", "silent"),
+    [((), "relay"), (("relay",), "error_detector"), (("relay", "error_detector"), "controller")],
+)
+def test_lockstep_names_the_missing_peer(start: Start, running: tuple[str, ...], silent: str) -> None:
+    modules = {"relay": "agv_plant.relay_node", "error_detector": "agv_cloud.error_detector_node"}
+    for name in running:
+        start(modules[name])
+    plant = start("agv_plant.plant_node", "--ros-args", "-p", "answer_timeout:=2.0")
+    status, said = plant.end()
+    assert status == 1
+    assert said.splitlines()[-1] == (f"no answer to step 0 on agv/cmd_vel within 2 s: is the {silent} running?")
+    assert "Traceback" not in said
+
+
+def test_a_node_with_a_wrong_parameter_says_so_in_one_line(start: Start) -> None:
+    status, said = start("agv_cloud.controller_node", "--ros-args", "-p", "kx:=25").end()
+    assert status == 1
+    assert said.splitlines() == ["controller.kx is a double, got the integer 25: write 25.0"]
