@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from agv_analysis.convergence import TOLERANCE
 from agv_analysis.run import Floats, Run
 from agv_ros.errors import UserError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+SMALLEST = 1e-6
+"""Errors [m] below this are drawn at it: a logarithm has no zero."""
 
 REFERENCE, DRIVEN, LOST = "#7f7f7f", "#1f6fb4", "#d62728"
 
@@ -57,27 +61,25 @@ def _within(values: Floats, reference: Floats) -> Floats:
 
 def _error(axes: Axes, run: Run) -> None:
     e = run.reference[:, :2] - run.pose[:, :2]
-    axes.plot(run.time, e[:, 1], color=DRIVEN, lw=1.0, label="y_r - y_c")
-    axes.plot(run.time, e[:, 0], color=DRIVEN, lw=1.0, ls=":", label="x_r - x_c")
-    if np.nanmax(np.abs(e)) > 1e3:
-        axes.set_yscale("symlog")
-    axes.set(ylabel="error [m]", title="Error, speed, outages")
+    axes.plot(run.time, np.maximum(np.hypot(e[:, 0], e[:, 1]), SMALLEST), color=DRIVEN, lw=0.8, label="distance")
+    axes.plot(run.time, np.maximum(np.abs(e[:, 1]), SMALLEST), color=REFERENCE, lw=0.6, label="|y_r - y_c|")
+    axes.axhline(TOLERANCE, color="black", lw=0.7, ls="--")
+    axes.set(yscale="log", ylabel="error [m]", title="Error (dashed: 1 cm), speed, outages")
     axes.legend(loc="upper right", fontsize="small")
 
 
 def _speed(axes: Axes, run: Run) -> None:
-    axes.plot(run.time, run.command[:, 0], color=DRIVEN, lw=1.0, label="v")
-    axes.plot(run.time, run.reference[:, 3], color=REFERENCE, lw=1.0, label="v_r")
+    axes.plot(run.time, run.command[:, 0], color=DRIVEN, lw=0.8, label="v")
+    axes.plot(run.time, run.reference[:, 3], color=REFERENCE, lw=1.2, label="v_r")
     v_max = run.scenario.controller.v_max
     if np.isfinite(v_max):
         for limit in (-v_max, v_max):
             axes.axhline(limit, color="black", lw=0.7, ls="--")
-    if np.nanmax(np.abs(run.command[:, 0]), initial=0.0) > 1e3:
-        axes.set_yscale("symlog")
+    axes.set_yscale("symlog", linthresh=2.0 * max(0.5, float(np.abs(run.reference[:, 3]).max())))
     axes.set(ylabel="speed [m/s]")
     axes.legend(loc="lower right", fontsize="small")
 
 
 def _age(axes: Axes, run: Run) -> None:
-    axes.fill_between(run.time, run.n_ul, step="post", color=LOST, lw=0.0)
+    axes.step(run.time, run.n_ul, where="post", color=LOST, lw=0.6)
     axes.set(xlabel="time [s]", ylabel="n_ul [steps]", ylim=(0, max(1.0, 1.05 * float(run.n_ul.max()))))

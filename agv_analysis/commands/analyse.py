@@ -15,8 +15,11 @@ from agv_analysis.commands import write_json
 @click.option(
     "--config", type=click.Path(path_type=Path), help="The run's params file, for a bag that does not carry it."
 )
+@click.option("--namespace", help="Which loop, for a bag of several.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
-def command(bag: Path, json_file: Path | None, config: Path | None, picture: Path | None) -> None:
+def command(
+    bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None
+) -> None:
     """Say from the recording BAG whether the loop is stable, and why.
 
     \b
@@ -25,15 +28,15 @@ def command(bag: Path, json_file: Path | None, config: Path | None, picture: Pat
       agv-ncs analyse bags/first --json first.json --picture first.png
       agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
     """
-    from agv_analysis.analysis import analyse as analyse_run
+    from agv_analysis.analysis import analyse
     from agv_analysis.picture import draw
     from agv_analysis.recording import read_run
     from agv_analysis.table import print_table
 
-    run_ = read_run(bag, config)
-    analysis = analyse_run(run_)
+    run = read_run(bag, config, namespace)
+    analysis = analyse(run)
     where = picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png"))
-    draw(run_, where)
+    draw(run, where)
     print_table(analysis)
     click.echo(f"bag:     {bag}\npicture: {where}")
     if json_file is not None:

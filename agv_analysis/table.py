@@ -1,0 +1,75 @@
+"""An analysis as a short table on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from agv_analysis.analysis import Analysis
+
+
+def print_table(analysis: Analysis) -> None:
+    """Print the figures, then one line for each disagreement between the criteria, then the notes."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for name, value in _rows(analysis):
+        table.add_row(name, value)
+    console.print(table)
+    for sentence in analysis.disagreements():
+        console.print(f"[bold yellow]They disagree:[/] {sentence}.")
+    for topic, count in analysis.run.unexplained.items():
+        console.print(
+            f"[bold red]Invalid:[/] {count} messages of {escape(topic)} are missing, and no channel lost them."
+        )
+    for note in analysis.run.notes:
+        console.print(f"[dim]Note: {escape(note)}.[/]")
+
+
+def _rows(analysis: Analysis) -> Iterator[tuple[str, str]]:
+    run, up = analysis.run, analysis.outages.uplink
+    ms = 1e3 * run.ts
+    yield "Run", f"{len(run)} steps of {ms:g} ms, seed {run.scenario.relay.seed}"
+    yield "Uplink", f"{up.loss_rate:.2%} lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
+    yield "Longest outage", f"{up.longest} slots ({up.longest * ms:g} ms)"
+    yield (
+        "Age of information",
+        (f"n_ul: mean {up.age.mean:.2f}, p99 {up.age.p99}, at most {up.age.max} steps ({up.age.max * ms:g} ms)"),
+    )
+    if analysis.outages.downlink.lost:
+        yield "Downlink", f"{analysis.outages.downlink.loss_rate:.2%} lost"
+    found = analysis.convergence
+    yield "Settling", f"{_steps(found.settle_1cm_steps, ms)} to 1 cm, {_steps(found.settle_2pct_steps, ms)} to 2 %"
+    yield "Overshoot", "no initial error" if found.overshoot is None else f"{found.overshoot:.2%}"
+    yield "Damping of the speed", found.damping or "the run cannot tell"
+    yield "Error", f"at most {found.position.peak:.3g} m, {found.position.final:.3g} m at the end"
+    yield (
+        "Paper's test",
+        _verdict(analysis.paper.stable, f"|lambda| at most {analysis.paper.radius:.6g}, at step {analysis.paper.k}"),
+    )
+    yield (
+        f"Pose always {analysis.n} steps old",
+        _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
+    )
+    yield f"Any outages up to {analysis.n} slots", _bursts(analysis)
+
+
+def _verdict(stable: bool, why: str) -> str:
+    return f"[green]stable[/] ({why})" if stable else f"[red]unstable[/] ({why})"
+
+
+def _bursts(analysis: Analysis) -> str:
+    found = analysis.bursts
+    if analysis.bursts_stable:
+        return _verdict(True, f"joint spectral radius at most {found.upper:.6g}, proved by a common norm")
+    if found.verdict == "unstable":
+        return _verdict(False, f"outages of {found.worst} slots grow by {found.lower:.6g} a step")
+    return f"[yellow]undecided[/] (joint spectral radius at least {found.lower:.6g})"
+
+
+def _steps(steps: int | None, ms: float) -> str:
+    return "never" if steps is None else f"{steps} steps ({steps * ms / 1e3:g} s)"
