@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from agv_analysis.cli import main
 from agv_analysis.commands.simulate import write_csv
 from agv_analysis.convergence import convergence
 from agv_analysis.run import Run
@@ -175,3 +178,36 @@ def test_the_csv_file_has_every_number_in_full(tmp_path: Path) -> None:
     assert [row["lost"] == "1" for row in rows] == run.lost.tolist()
     assert [int(row["n_ul"]) for row in rows] == run.n_ul.tolist()
     assert math.isclose(float(rows[-1]["t"]), 199 * 0.005)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_says_and_writes_what_analyse_does(tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        main, ["simulate", PAPER, "--set", "controller.kx=250.0", "--json", str(tmp_path / "run.json")]
+    )
+    assert done.exit_code == 0, done.output
+    assert "under" in done.output
+    found = json.loads((tmp_path / "run.json").read_text())
+    assert {name: found[name] for name in ("loss_rate", "n_ul_max", "settle_1cm_steps", "damping")} == {
+        "loss_rate": 0.0, "n_ul_max": 0, "settle_1cm_steps": 5, "damping": "under",
+    }  # fmt: skip
+    assert found["overshoot"] == pytest.approx(0.25)
+    assert {"settle_2pct_steps", "paper_stable", "lifted_stable", "bursts_stable"} <= found.keys()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["missing.yaml"], "missing.yaml: cannot be read"),
+        ([PAPER, "--set", "plant.duration=inf"], "plant.duration is inf"),
+        ([PAPER, "--set", "controller.kx=nan"], "controller.kx must be"),
+        ([PAPER, "--set", "plant.duration=0.1", "--csv", "/nowhere/run.csv"], "/nowhere/run.csv: cannot be written"),
+    ],
+)
+def test_what_the_command_cannot_do_is_one_line_and_status_1(arguments: list[str], said: str) -> None:
+    done = CliRunner().invoke(main, ["simulate", *arguments])
+    assert done.exit_code == 1
+    assert said in done.output
+    assert "Traceback" not in done.output

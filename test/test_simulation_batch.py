@@ -70,8 +70,8 @@ def test_scenarios_of_different_length_and_track_go_together() -> None:
     line = load_scenario(OUTAGES, ["error_detector.track=line", "plant.duration=1.0"])
     table = simulate_batch([short, line, long, short, line], [1, 2], workers=1)
     assert table["steps"].tolist() == [[200, 200], [200, 200], [600, 600], [200, 200], [200, 200]]
-    assert (table[0] == table[3]).all()
-    assert (table[1] == table[4]).all()
+    assert table[0].tobytes() == table[3].tobytes()
+    assert table[1].tobytes() == table[4].tobytes()
     assert table["final"][0, 0] != table["final"][1, 0]
     assert table[:1].tobytes() == simulate_batch([short], [1, 2]).tobytes()
 
@@ -89,6 +89,31 @@ def test_without_an_initial_error_there_is_no_share_of_it() -> None:
     row = simulate_batch([load_scenario(OUTAGES, start)], [1])[0, 0]
     assert (row["settle_1cm_steps"], row["settle_2pct_steps"], row["peak"]) == (0, -1, 0.0)
     assert np.isnan(row["overshoot"])
+
+
+LINE = (
+    "error_detector.track=line", "relay.uplink.model=perfect", "plant.initial_pose=[0.0, 0.0, 1.5707963267948966]",
+    "plant.duration=10.0",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kx", [1.0, 25.0, 300.0])
+def test_twins_on_a_line_come_together_as_the_poles_of_the_loop_say(kx: float) -> None:
+    # On a line at 1 m/s every step multiplies the error along it by 1 - T_s K_x, that across it, of y and theta, by
+    # [[1, T_s], [-T_s K_y, 1 - T_s K_theta]].
+    scenario = load_scenario(OUTAGES, [*LINE, f"controller.kx={kx}"])
+    (row,) = simulate_batch([scenario], [1], twins=True)[0]
+    across = np.linalg.matrix_power(np.array([[1.0, 0.005], [-0.005, 0.99]]), 2000) @ [-1.0, 1.0]
+    along = (1.0 - 0.005 * kx) ** 2000
+    assert row["contraction"] == pytest.approx(np.hypot(along, np.linalg.norm(across)) / 3**0.5, rel=0.01)
+    (alone,) = simulate_batch([scenario], [1])[0]
+    assert np.isnan(alone["contraction"])
+    assert alone.tobytes()[:-8] == row.tobytes()[:-8]  # all but the contraction
+
+
+def test_twins_part_where_the_loop_is_unstable() -> None:
+    unstable = [load_scenario(OUTAGES, [*LINE, f"controller.kx={kx}"]) for kx in (401.0, 500.0)]  # 1 - T_s K_x < -1
+    assert (simulate_batch(unstable, [1], twins=True)["contraction"] > 1e3).all()
 
 
 def test_nothing_to_do_is_done() -> None:
@@ -113,6 +138,6 @@ def test_what_cannot_be_run_is_refused_before_anything_is() -> None:
 @given(rows=st.integers(0, 40), columns=st.integers(0, 20), workers=st.integers(1, 16))
 @settings(deadline=None, derandomize=True)
 def test_work_is_parted_without_gap_or_overlap(rows: int, columns: int, workers: int) -> None:
-    units = _Batch(ONE * rows, range(columns)).units(workers)
+    units = _Batch(ONE * rows, range(columns), twins=False).units(workers)
     assert sorted(job for unit in units for job in unit) == [(i, j) for i in range(rows) for j in range(columns)]
     assert len(units) >= min(rows * columns // 2, workers)

@@ -284,3 +284,30 @@ def statistics_of_two(reference: Rows, one: Case, other: Case) -> tuple[Statisti
             )
     y_r = reference[0][1]
     return end(first, y_r - one.start.y, one.settings.ts), end(second, y_r - other.start.y, other.settings.ts)
+
+
+def statistics_of_twins(reference: Rows, case: Case, twin: Loop) -> tuple[Statistics, float]:
+    """A run as `statistics`, and how far a twin of it, begun elsewhere and with the same losses, is in the end.
+
+    That is the distance of the two AGVs in (x, y, theta) [m, m, rad] as a multiple of what it was at the beginning: a
+    loop that forgets where it began contracts it. inf if either leaves the range of numbers.
+    """
+    run, begun, ends = begin(reference, case), twin, False
+    for k in range(len(case.lost)):
+        x_r, y_r, theta_r, v_r, w_r = reference[k]
+        lost, downlink_lost = case.lost[k], case.downlink_lost[k]
+        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, lost, downlink_lost, case.settings)
+        if not ends:
+            twin, sent = slot(twin, x_r, y_r, theta_r, v_r, w_r, lost, downlink_lost, case.settings)
+            ends = not goes_on(twin, sent)
+        if not run.goes_on:
+            break
+    found = end(run, reference[0][1] - case.start.y, case.settings.ts)
+    if ends or not run.goes_on:
+        return found, math.inf
+    return found, apart(run.loop, twin) / apart(case.start, begun)
+
+
+def apart(one: Loop, other: Loop) -> float:
+    """Distance of two AGVs in (x, y, theta) [m, m, rad], a radian counting as a meter."""
+    return math.hypot(math.hypot(one.x - other.x, one.y - other.y), one.theta - other.theta)
