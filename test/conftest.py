@@ -102,7 +102,7 @@ def start() -> Iterator[Start]:
     def run(*command: str, **options: Any) -> Started:
         arguments = list(command) if command[0].startswith("/") else [sys.executable, "-m", *command]
         process = subprocess.Popen(
-            arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=REPOSITORY, **options
+            arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **({"cwd": REPOSITORY} | options)
         )
         started.append(Started(process))
         return started[-1]
