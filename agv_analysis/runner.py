@@ -71,8 +71,8 @@ class Outcome:
     """How a run ended."""
 
     steps: int
-    seconds: float
-    """Wall time of the loop, without start-up and shut-down."""
+    rate: float
+    """Steps per second of wall time, without start-up and shut-down; 0 if there were too few to tell."""
     failure: str
     """Why the run ended early, empty if it did not."""
     recording: str
@@ -114,16 +114,16 @@ def _run_nodes(
 ) -> Outcome:
     for node in loop if recorder is None else (*loop, recorder):
         executor.add_node(node)
-    begun = _Stopwatch()
+    pace = _Pace()
 
     def is_done() -> bool:
         if plant.k % _STEPS_PER_LOOK == 1:
-            begun.start()
+            pace.see(plant.k)
             progress(plant.k)
         return plant.finished or stop.requested
 
     spin(executor, is_done)
-    seconds = begun.seconds()
+    pace.see(plant.k)
     progress(plant.k)
     for node in loop:
         node.close()
@@ -134,7 +134,7 @@ def _run_nodes(
     executor.shutdown()
     failure = plant.failure or (f"interrupted at step {plant.k}" if stop.requested else "")
     return Outcome(
-        plant.k, seconds, failure, recorder.summary if recorder else "", recorder.failure if recorder else ""
+        plant.k, pace.rate, failure, recorder.summary if recorder else "", recorder.failure if recorder else ""
     )
 
 
@@ -160,18 +160,24 @@ def _params_file(scenario: Scenario) -> Iterator[Path]:
         yield path
 
 
-class _Stopwatch:
-    """Time since the first `start`."""
+class _Pace:
+    """Speed between the first and the last step that was seen."""
 
     def __init__(self) -> None:
-        self._started: float | None = None
+        self._first: tuple[int, float] | None = None
+        self._last = (0, 0.0)
 
-    def start(self) -> None:
-        if self._started is None:
-            self._started = time.monotonic()
+    def see(self, steps: int) -> None:
+        """So many steps are done now."""
+        if steps > self._last[0]:
+            self._last = (steps, time.monotonic())
+            self._first = self._first or self._last
 
-    def seconds(self) -> float:
-        return 0.0 if self._started is None else time.monotonic() - self._started
+    @property
+    def rate(self) -> float:
+        """Steps per second."""
+        (k, begun), (end_k, ended) = self._first or self._last, self._last
+        return (end_k - k) / (ended - begun) if end_k > k else 0.0
 
 
 def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -> Outcome:
@@ -187,7 +193,8 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
                 nodes["recorder"] = _Process("recorder", params, as_dict(_recording(scenario, bag, params)))
             for name in reversed(SCHEMAS):
                 nodes[name] = _Process(name, connected_params, {})
-            return _watch(nodes, stop, progress)
+            outcome = _watch(nodes, stop, progress)
+            return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
         finally:
             for node in nodes.values():
                 node.stop(signal.SIGTERM)
@@ -195,12 +202,9 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
 
 def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcome:
     """Wait for the plant to end, then stop the others, the recorder last."""
-    plant, begun = nodes["plant"], _Stopwatch()
+    plant = nodes["plant"]
     while plant.is_running(_LOOK_PERIOD) and all(node.is_running() for node in nodes.values()) and not stop.requested:
-        if plant.steps:
-            begun.start()
-            progress(plant.steps)
-    seconds = begun.seconds()
+        progress(plant.steps)
     ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
     recorder = nodes.pop("recorder", None)
     for node in nodes.values():
@@ -217,7 +221,7 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
         failure = plant.last_words() if plant.status else ""
     recording = recorder.last_words() if recorder else ""
     failed = recorder is not None and recorder.status != 0
-    return Outcome(plant.steps, seconds, failure, "" if failed else recording, recording if failed else "")
+    return Outcome(plant.steps, plant.pace.rate, failure, "" if failed else recording, recording if failed else "")
 
 
 class _Process:
@@ -226,6 +230,7 @@ class _Process:
     def __init__(self, name: str, params: Path, settings: dict[str, Any]) -> None:
         self.name = name
         self.steps = 0
+        self.pace = _Pace()
         self._lines: list[str] = []
         command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
         for parameter, value in settings.items():
@@ -247,6 +252,7 @@ class _Process:
                 self._lines.append(text)
             else:
                 self.steps = steps
+                self.pace.see(steps)
 
     @property
     def status(self) -> int | None:

@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 
 class Comparison(NamedTuple):
-    """Two speeds in one unit, the larger the better; each module of this folder gives a list of them by `measure()`."""
+    """Two figures in one unit; each module of this folder gives a list of them by `measure()`.
+
+    They are speeds, the larger the better, unless `smaller_is_better`.
+    """
 
     what: str
     ours: float
@@ -14,9 +17,16 @@ class Comparison(NamedTuple):
     peer: float
     unit: str
     aim: float | None = None
-    """Smallest ratio ours / peer that is aimed at, None where there is no aim."""
+    """Smallest ratio that is aimed at, None where there is no aim."""
+    smaller_is_better: bool = False
 
     @property
     def ratio(self) -> float:
-        """Ours as a multiple of the peer's."""
-        return self.ours / self.peer
+        """How many times as good as the peer; nan where neither can be told from zero."""
+        better, worse = (self.peer, self.ours) if self.smaller_is_better else (self.ours, self.peer)
+        return better / worse if worse else float("nan")
+
+    @property
+    def met(self) -> bool | None:
+        """Is the aim reached? None without one."""
+        return None if self.aim is None else self.ratio >= self.aim

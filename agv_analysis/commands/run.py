@@ -52,8 +52,7 @@ def command(
             outcome = runner.run_in_processes(scenario, bag, progress)
         else:
             outcome = runner.run_in_process(scenario, bag, progress)
-    rate = f", {outcome.steps / outcome.seconds:.0f} steps/s" if outcome.seconds else ""
-    click.echo(f"{outcome.steps} steps in {outcome.seconds:.1f} s{rate}")
+    click.echo(f"{outcome.steps} steps" + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
     if outcome.recording:
         click.echo(f"bag: {bag}: {outcome.recording}")
     failures = [failure for failure in (outcome.failure, outcome.recording_failure) if failure]
