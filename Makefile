@@ -11,7 +11,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test bench sample clean
+.PHONY: demo test bench docs sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -26,6 +26,9 @@ test: $(VENV)/test.stamp ## style, types and tests
 
 bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
 	$(BIN)/python -m benchmarks $(BENCH)
+
+docs: $(VENV)/run.stamp ## bring README.md and docs/ up to date with the code
+	$(BIN)/python docs/update.py
 
 sample: $(VENV)/run.stamp ## make the sample bag anew
 	rm -rf bags/sample

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-COMMANDS = ("run", "analyse", "simulate")
+COMMANDS = ("run", "analyse", "parameters", "simulate", "sweep")
 
 
 class _Group(click.Group):

@@ -1,0 +1,56 @@
+"""Bring README.md and docs/ up to date with what the code does: `make docs`. A test fails where they are not."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[1]
+BEGIN, END = "<!-- demo:begin -->\n", "<!-- demo:end -->"
+
+
+def command(*arguments: str) -> str:
+    """What a command of agv-ncs prints."""
+    environment = {**os.environ, "COLUMNS": "110"}
+    return subprocess.run(
+        [sys.executable, "-m", "agv_analysis.cli", *arguments],
+        cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, text=True, check=True,
+    ).stdout  # fmt: skip
+
+
+def parameters_page() -> str:
+    """docs/parameters.md."""
+    return (
+        "# Parameters\n\nMade by `agv-ncs parameters` from the declarations in the code. `/**/<node>:` in a params "
+        "file addresses a node in any namespace.\n\n" + command("parameters")
+    )
+
+
+def demo_block(analysed: str) -> str:
+    """The part of README.md that shows what the demo prints, from what `analyse` printed; paths are the demo's."""
+    table = "\n".join(line.rstrip() for line in re.split(r"\nbag: ", analysed)[0].splitlines())
+    return f"{BEGIN}```\n{table}\nbag:     bags/demo\npicture: bags/demo/overview.png\n```\n"
+
+
+def readme_with(block: str) -> str:
+    """README.md with another demo block."""
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    return re.sub(re.escape(BEGIN) + ".*?(?=" + re.escape(END) + ")", lambda _: block, text, flags=re.DOTALL)
+
+
+def main() -> None:
+    """Run the demo's scenario and write everything anew."""
+    with tempfile.TemporaryDirectory() as folder:
+        bag = str(Path(folder) / "bag")
+        command("run", "config/outages.yaml", "--bag", bag)
+        analysed = command("analyse", bag, "--picture", "docs/images/demo.png")
+    (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
+    (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

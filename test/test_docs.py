@@ -1,0 +1,46 @@
+"""README and docs say what is true today: made anew, they come out as they stand."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def update() -> Any:
+    spec = importlib.util.spec_from_file_location("update", REPOSITORY / "docs/update.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_page_of_parameters_is_current(update: Any) -> None:
+    assert update.parameters_page() == (REPOSITORY / "docs/parameters.md").read_text()
+
+
+def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    bag = str(tmp_path / "bag")
+    update.command("run", "config/outages.yaml", "--bag", bag)
+    block = update.demo_block(update.command("analyse", bag))
+    assert block in (REPOSITORY / "README.md").read_text()
+
+
+def test_the_commands_of_the_readme_exist(agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    readme = (REPOSITORY / "README.md").read_text()
+    _, known = agv_ncs("--help")
+    for command in set(re.findall(r"^ +agv-ncs (\w+)", readme, re.MULTILINE)):
+        assert re.search(rf"^  {command} ", known, re.MULTILINE), command
+    targets = re.findall(r"^(\w+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
+    assert set(re.findall(r"(?:`|^ +)make (\w+)", readme, re.MULTILINE)) <= set(targets)
+    for path in set(re.findall(r"(?:config|docs|bags)/[\w/]+\.\w+", readme)):
+        assert (REPOSITORY / path).exists() or path.startswith("bags/demo/"), path
