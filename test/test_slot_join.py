@@ -122,6 +122,25 @@ def test_a_node_that_joins_a_running_loop(fates: str, k: int, order: list[bool])
     assert answers == schedule.answers()[1 + blind :]
 
 
+@pytest.mark.parametrize("slot_first", [True, False])
+def test_what_a_run_left_behind_is_not_taken_for_the_next_one_s(slot_first: bool) -> None:
+    join = SlotJoin[Message](START)
+    begin: list[Message | Slot] = [Message(t(0), 1), Slot(t(0), t(0), DELIVERED)]
+    for event in [*(reversed(begin) if slot_first else begin), Message(t(2), 1)]:  # slot 2 never comes: the run ends
+        list(feed(join, event))
+    for slot in Schedule("...").slots():
+        assert not join.add_slot(slot)
+    answers = [answer for message in Schedule("...", 2).messages() for answer in feed(join, message)]
+    assert answers == Schedule("...", 2).answers()
+
+
+def test_a_run_that_begins_with_an_unusable_message_does_not_go_on_with_the_last_run_s() -> None:
+    join = SlotJoin[Message](START)
+    for event in [Message(t(0)), Slot(t(0), t(0), DELIVERED), t(0)]:
+        list(feed(join, event))
+    assert [one.message for one in join.add_slot(Slot(t(0), t(0), DELIVERED))] == [None]
+
+
 def test_a_slot_waits_for_the_message_that_it_names() -> None:
     join = SlotJoin[Message](START)
     assert not join.add_slot(Slot(t(0), t(0), DELIVERED))
