@@ -126,7 +126,8 @@ def test_a_node_that_joins_a_running_loop(fates: str, k: int, order: list[bool])
 def test_what_a_run_left_behind_is_not_taken_for_the_next_one_s(slot_first: bool) -> None:
     join = SlotJoin[Message](START)
     begin: list[Message | Slot] = [Message(t(0), 1), Slot(t(0), t(0), DELIVERED)]
-    for event in [*(begin[::-1] if slot_first else begin), Message(t(2), 1)]:  # slot 2 never comes: the run ends
+    left_behind: list[Message | Slot] = [*(begin[::-1] if slot_first else begin), Message(t(2), 1)]
+    for event in left_behind:  # slot 2 never comes: the run ends
         list(feed(join, event))
     for slot in Schedule("...").slots():
         assert not join.add_slot(slot)
