@@ -17,7 +17,7 @@ from agv_analysis.scenario import load_scenario
 pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
 if TYPE_CHECKING:
-    from conftest import Drive
+    from test.conftest import Drive
 
 REPOSITORY = Path(__file__).parents[1]
 TOPICS = 9

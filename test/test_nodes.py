@@ -29,7 +29,7 @@ from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS, LoopNode
 
 if TYPE_CHECKING:
-    from conftest import Start
+    from test.conftest import Start
 
 NODES: dict[str, type[LoopNode[Any]]] = {
     "agv_plant.plant_node": PlantNode,
@@ -50,7 +50,7 @@ class Bench:
         self.executor.add_node(self.probe)
         self.nodes: list[Node] = [self.probe]
 
-    def add(self, kind: type[LoopNode[Any]], **parameters: Any) -> Any:
+    def add(self, kind: Callable[..., LoopNode[Any]], **parameters: Any) -> Any:
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
         node = kind(parameter_overrides=overrides, context=self.context, use_global_arguments=False)
         self.executor.add_node(node)
@@ -60,6 +60,10 @@ class Bench:
     def until(self, condition: Callable[[], bool]) -> None:
         """Run callbacks until the condition holds; a minute is only there so that a hanging test ends."""
         assert spin_for(self.executor, condition, 60.0)
+
+    def until_count(self, messages: list[Any], count: int) -> None:
+        """Run callbacks until so many messages are there."""
+        self.until(lambda: len(messages) == count)
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         client = self.probe.create_client(kind, name)
@@ -250,7 +254,7 @@ def test_a_nan_command_is_rejected_and_the_agv_keeps_the_last_good_one(bench: Be
     poses = bench.received(PoseStamped, "agv/pose")
     commands, slots = bench.publisher(TwistStamped, "agv/cmd_vel"), bench.publisher(TimeReference, "agv/slot")
     for k, v in enumerate((2.0, math.nan, 1.0)):
-        bench.until(lambda k=k: len(poses) == k + 1)
+        bench.until_count(poses, k + 1)
         command, slot = TwistStamped(), TimeReference()
         command.header.stamp = slot.header.stamp = slot.time_ref = pose(k).header.stamp
         command.twist.linear.x, slot.source = v, "delivered"

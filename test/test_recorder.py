@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
+from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -29,7 +30,7 @@ from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS
 
 if TYPE_CHECKING:
-    from conftest import Drive, Start
+    from test.conftest import Drive, Start
 
 REPOSITORY = Path(__file__).parents[1]
 AgvNcs = Callable[..., tuple[int, str]]
@@ -50,9 +51,10 @@ def test_rosbags_reads_what_was_recorded(bag: Path) -> None:
         assert (reader.start_time, reader.end_time) == (1_000_000_000, 1_000_000_000 + 199 * 5_000_000 + 1)
         for connection in reader.connections:
             assert connection.digest == store.hash_rihs01(connection.msgtype)
+            assert isinstance(connection.ext, ConnectionExtRosbag2)
             assert connection.ext.offered_qos_profiles[0].reliability.name == "RELIABLE"
         first = next(message for c, _, message in reader.messages() if c.topic == "/agv/pose")
-    pose = store.deserialize_cdr(first, "geometry_msgs/msg/PoseStamped")
+    pose: Any = store.deserialize_cdr(first, "geometry_msgs/msg/PoseStamped")
     assert (pose.header.frame_id, pose.pose.position.y) == ("map", 5.0)
 
 
