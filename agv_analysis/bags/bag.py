@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,12 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Batch
+from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.errors import BagError, UndecodableError
 from agv_analysis.bags.findings import Findings
-from agv_analysis.bags.mcap_file import McapFile
 from agv_analysis.bags.records import Channel, Schema
+from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
 from agv_analysis.bags.schema import parse_schema
+from agv_analysis.bags.storage import Storage
 from agv_analysis.bags.table import Table
+
+Progress = Callable[[int], None]
+"""Called with the share of a bag that has been read [%], every now and then."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class Bag(Mapping[str, NDArray[np.void]]):
 
     path: Path
     topics: dict[str, Topic]
+    """All topics of the bag, those too that were not asked for."""
     metadata: dict[str, dict[str, str]]
     """MCAP's Metadata records by name."""
     problems: tuple[str, ...]
@@ -63,6 +70,9 @@ class Bag(Mapping[str, NDArray[np.void]]):
             raise BagError(f"{self.path}: {topic} was not asked for when the bag was read")
         raise BagError(f"{self.path}: no topic {topic}; it has {', '.join(sorted(self.topics)) or 'none'}")
 
+    def __contains__(self, topic: object) -> bool:
+        return topic in self._arrays
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._arrays)
 
@@ -75,108 +85,120 @@ class Bag(Mapping[str, NDArray[np.void]]):
         Raises BagError if the topic is not in the bag.
         """
         if topic not in self.topics:
-            self[topic]
-        return [payload for _, batch in _batches(self.path, {topic}) for payload in batch.payloads()]
+            raise BagError(f"{self.path}: no topic {topic}; it has {', '.join(sorted(self.topics)) or 'none'}")
+        return [
+            payload
+            for storage in open_files(locate(self.path))
+            for _, batch in storage.batches(lambda channel: channel.topic == topic)
+            for payload in batch.payloads()
+        ]
 
 
-def _files(path: Path) -> list[Path]:
-    if not path.is_dir():
-        return [path]
-    return sorted(path.glob("*.mcap"))
+def read_bag(path: Path | str, topics: Collection[str] | None = None, progress: Progress | None = None) -> Bag:
+    """Read a rosbag2 directory, split or not, with metadata.yaml or without, or a bare .mcap or .db3 file.
 
-
-def _batches(path: Path, topics: Collection[str]) -> Iterator[tuple[Channel, Batch]]:
-    for name in _files(path):
-        file = McapFile(name)
-        yield from file.batches(lambda channel: channel.topic in topics)
-        file.close()
-
-
-def read_bag(path: Path | str, topics: Collection[str] | None = None) -> Bag:
-    """Read a rosbag2 directory, or a bare MCAP file.
-
-    `topics`: those that are wanted as arrays, None for all. Raises BagError if there is no bag at `path`.
+    `topics`: those that are wanted as arrays, None for all; an empty collection reads what the bag holds and checks it.
+    Whatever is wrong with the bag is in its `problems`. Raises BagError if there is no bag at `path`, or one of which
+    nothing can be read.
     """
     path = Path(path)
-    if not path.exists():
-        raise BagError(f"{path}: there is no such file or directory")
-    files = _files(path)
-    if not files:
-        raise BagError(f"{path}: no .mcap file in this directory")
+    contents = locate(path)
     reading = _Reading(topics)
-    for name in files:
-        reading.read(McapFile(name))
-    return reading.bag(path)
+    for number, storage in enumerate(open_files(contents)):
+        for channel, batch in storage.batches(reading.is_wanted):
+            reading.take(storage, channel, batch)
+            if progress is not None:
+                share = storage.position / max(1, storage.size)
+                progress(int(100 * (number + share) / len(contents.files)))
+        reading.finish(storage)
+    return reading.bag(path, contents)
 
 
 class _Reading:
     """What has been read so far, over all files of a bag."""
 
     def __init__(self, topics: Collection[str] | None) -> None:
-        self._wanted = topics
+        self._wanted = None if topics is None else frozenset(topics)
         self._findings = Findings()
+        self._known: dict[str, tuple[Channel, Schema | None]] = {}
         self._tables: dict[str, Table] = {}
         self._refusals: dict[str, str] = {}
-        self._channels: dict[str, tuple[Channel, Schema | None]] = {}
-        self._counts: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
         self._metadata: dict[str, dict[str, str]] = {}
 
-    def read(self, file: McapFile) -> None:
-        for channel, batch in file.batches(lambda channel: self._wanted is None or channel.topic in self._wanted):
-            self._take(file, channel, batch)
-        for channel in file.channels.values():
-            known = channel.topic in self._channels
-            self._channels.setdefault(channel.topic, (channel, file.schemas.get(channel.schema_id)))
-            self._counts[channel.topic] = self._counts.get(channel.topic, 0) + file.found.get(channel.id, 0)
-            if not known and (self._wanted is None or channel.topic in self._wanted):
-                self._table(file, channel)
-        self._metadata.update(file.metadata)
-        self._findings.merge(file.findings)
-        file.close()
+    def is_wanted(self, channel: Channel) -> bool:
+        """Are the messages of this channel to become an array?"""
+        return (self._wanted is None or channel.topic in self._wanted) and channel.topic not in self._refusals
 
-    def _table(self, file: McapFile, channel: Channel) -> Table | None:
-        topic = channel.topic
-        if topic in self._tables or topic in self._refusals:
-            return self._tables.get(topic)
-        schema = file.schemas.get(channel.schema_id)
+    def take(self, storage: Storage, channel: Channel, batch: Batch) -> None:
+        """Add a batch to the table of its topic; a topic that cannot be decoded is given up."""
+        table = self._table(storage, channel)
+        if table is not None:
+            try:
+                table.append(batch)
+            except UndecodableError as error:
+                self._refuse(channel.topic, error)
+
+    def finish(self, storage: Storage) -> None:
+        """Take over what is known of a file after its last message."""
+        for number, channel in storage.channels.items():
+            self._counts[channel.topic] += storage.counts[number]
+            self._known.setdefault(channel.topic, (channel, storage.schemas.get(channel.schema_id)))
+            if self.is_wanted(channel):
+                self._table(storage, channel)
+        self._metadata.update(storage.metadata)
+        self._findings.merge(storage.findings)
+
+    def _table(self, storage: Storage, channel: Channel) -> Table | None:
+        """The table of a channel's topic, None if its messages cannot be decoded."""
+        topic, schema = channel.topic, storage.schemas.get(channel.schema_id)
+        _, first = self._known.setdefault(topic, (channel, schema))
+        if topic in self._refusals:
+            return None
         try:
             if channel.encoding != "cdr":
                 raise UndecodableError(f"its messages are encoded as {channel.encoding!r}; only cdr is read")
-            if schema is None:
+            if schema is None or first is None:
                 raise UndecodableError("the bag does not hold the definition of its type")
-            expected = file.statistics.by_channel.get(channel.id, 0) if file.statistics else 0
-            table = Table(parse_schema(schema.name, schema.encoding, schema.text), expected)
+            if (schema.name, schema.encoding, schema.text) != (first.name, first.encoding, first.text):
+                raise UndecodableError(f"it has messages of two types, {first.name} and {schema.name}")
+            if topic not in self._tables:
+                kind = parse_schema(schema.name, schema.encoding, schema.text)
+                self._tables[topic] = Table(kind, storage.expected(channel.id))
         except UndecodableError as error:
-            self._refusals[topic] = f"cannot be decoded: {error}"
-            return None
-        return self._tables.setdefault(topic, table)
+            self._refuse(topic, error)
+        return self._tables.get(topic)
 
-    def _take(self, file: McapFile, channel: Channel, batch: Batch) -> None:
-        table = self._table(file, channel)
-        if table is None:
-            return
-        try:
-            table.append(batch)
-        except UndecodableError as error:
-            self._refusals[channel.topic] = f"cannot be decoded: {error}"
-            del self._tables[channel.topic]
+    def _refuse(self, topic: str, error: UndecodableError) -> None:
+        self._refusals[topic] = f"cannot be decoded: {error}"
+        self._tables.pop(topic, None)
 
-    def bag(self, path: Path) -> Bag:
-        for topic, table in self._tables.items():
+    def bag(self, path: Path, contents: Contents) -> Bag:
+        """The bag, once all files have been read."""
+        arrays = {topic: table.rows for topic, table in sorted(self._tables.items())}
+        self._findings.merge(contents.findings)
+        self._compare_with_metadata(contents)
+        for topic, table in sorted(self._tables.items()):
             if table.layouts.misfits:
-                self._findings.add(
-                    f"{topic}: message that is not of its type, left out ({table.layouts.first_misfit})",
-                    table.layouts.misfits, is_loss=True,
-                )  # fmt: skip
-        topics = {name: self._topic(name) for name in sorted(self._channels)}
-        refused = tuple(f"{topic}: {reason}" for topic, reason in self._refusals.items())
-        return Bag(
-            path, topics, self._metadata, self._findings.texts() + refused, not self._findings.is_loss,
-            {name: table.rows for name, table in self._tables.items()}, self._refusals,
-        )  # fmt: skip
+                what = f"{topic}: message that is not of its type, left out ({table.layouts.first_misfit})"
+                self._findings.add(what, table.layouts.misfits, is_loss=True)
+            check_times(topic, arrays[topic], self._findings)
+        for topic, reason in sorted(self._refusals.items()):
+            self._findings.add(f"{topic}: topic that {reason}")
+        topics = {name: self._topic(name) for name in sorted(self._known)}
+        findings = self._findings
+        return Bag(path, topics, self._metadata, findings.texts(), not findings.is_loss, arrays, self._refusals)
+
+    def _compare_with_metadata(self, contents: Contents) -> None:
+        for topic, expected in contents.counts.items():
+            found = self._counts[topic]
+            if found < expected:
+                what = f"{topic}: message that {METADATA} counts and that is not there"
+                self._findings.add(what, expected - found, is_loss=True)
+            elif found > expected:
+                self._findings.add(f"{topic}: message more than {METADATA} counts", found - expected)
 
     def _topic(self, name: str) -> Topic:
-        channel, schema = self._channels[name]
+        channel, schema = self._known[name]
         kind, text = (schema.name, schema.text) if schema else ("", "")
-        qos = channel.metadata.get("offered_qos_profiles", "")
-        return Topic(name, kind, self._counts.get(name, 0), text, qos)
+        return Topic(name, kind, self._counts[name], text, channel.metadata.get("offered_qos_profiles", ""))

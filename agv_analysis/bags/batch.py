@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.errors import UndecodableError
-from agv_analysis.bags.layout import Layout, trace
+from agv_analysis.bags.layout import LEAD, Layout, trace
 from agv_analysis.bags.schema import Struct
 
 Bytes = NDArray[np.uint8]
@@ -19,25 +19,31 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Batch:
-    """Messages of one topic that lie in one buffer, in file order."""
+    """Messages of one topic in one buffer, in file order; each is its lead (log and publish time), then its payload."""
 
     buffer: Bytes
     starts: Ints
-    """Where each payload begins, shape (n,)."""
+    """Where each message begins, shape (n,)."""
     sizes: Ints
-    """Bytes of each payload, shape (n,)."""
-    log_time: Ints
-    """[ns], shape (n,)."""
-    publish_time: Ints
-    """[ns], shape (n,)."""
+    """Bytes of each message, the lead of 16 included, shape (n,)."""
 
     def __len__(self) -> int:
         return len(self.starts)
 
+    @property
+    def log_times(self) -> Ints:
+        """[ns], shape (n,)."""
+        return numbers_at(self.buffer, self.starts, "<i8")
+
+    @property
+    def publish_times(self) -> Ints:
+        """[ns], shape (n,)."""
+        return numbers_at(self.buffer, self.starts + 8, "<i8")
+
     def payloads(self) -> Iterator[bytes]:
-        """The messages' bytes, one after the other."""
+        """The messages as they were sent, one after the other."""
         for begin, size in zip(self.starts.tolist(), self.sizes.tolist(), strict=True):
-            yield self.buffer[begin : begin + size].tobytes()
+            yield self.buffer[begin + LEAD : begin + size].tobytes()
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ class Group:
     layout: Layout
     places: Ints
     """Their places in the batch, shape (g,)."""
-    payloads: Bytes
+    messages: Bytes
     """Their bytes, shape (g, size)."""
 
 
@@ -66,6 +72,8 @@ class Layouts:
     def split(self, batch: Batch) -> list[Group]:
         """The messages of a batch by layout; those that are not of the topic's type are counted as misfits."""
         sizes = batch.sizes
+        if not len(batch):
+            return []
         if (sizes == sizes[0]).all():
             return list(self._of_size(batch, np.arange(len(batch)), int(sizes[0])))
         return [
@@ -76,57 +84,61 @@ class Layouts:
 
     def _of_size(self, batch: Batch, places: Ints, size: int) -> Iterator[Group]:
         """Groups of the messages at `places`, all of which have `size` bytes."""
-        payloads = gather(batch.buffer, batch.starts[places], size)
+        messages = gather(batch.buffer, batch.starts[places], size)
         layout = self._latest.get(size)
         while len(places):
-            layout = layout or self._trace(payloads[0].tobytes())
+            layout = layout or self._trace(messages[0].tobytes())
             if layout is None:
-                places, payloads = places[1:], payloads[1:]
+                places, messages = places[1:], messages[1:]
                 continue
-            same = _has_layout(payloads, layout)
+            same = _has_layout(messages, layout)
             if same.all():
-                yield Group(layout, places, payloads)
+                yield Group(layout, places, messages)
                 return
             if same.any():
-                yield Group(layout, places[same], payloads[same])
-                places, payloads = places[~same], payloads[~same]
+                yield Group(layout, places[same], messages[same])
+                places, messages = places[~same], messages[~same]
             layout = None
 
-    def _trace(self, payload: bytes) -> Layout | None:
+    def _trace(self, message: bytes) -> Layout | None:
         """Layout of a message, None if it is not of the topic's type."""
         try:
-            layout = trace(self._kind, payload)
+            layout = trace(self._kind, message)
         except UndecodableError as error:
             self.first_misfit = self.first_misfit or str(error)
             self.misfits += 1
             return None
         layout = self._known.setdefault(layout.key, layout)
-        self._latest[len(payload)] = layout
+        self._latest[len(message)] = layout
         return layout
 
 
 def gather(buffer: Bytes, starts: Ints, size: int) -> Bytes:
     """Copies of the `size` bytes that begin at each of `starts`, shape (n, size)."""
-    if size == 0 or not len(starts):
-        return np.empty((len(starts), size), np.uint8)
-    windows: NDArray[Any] = np.ndarray((len(buffer) - size + 1,), f"V{size}", buffer, strides=(1,))
-    return np.asarray(windows[starts].view(np.uint8).reshape(-1, size))
+    return np.asarray(numbers_at(buffer, starts, f"V{size}").view(np.uint8).reshape(-1, size))
 
 
-def values_at(payloads: Bytes, offset: int, code: str) -> NDArray[Any]:
-    """The value of numpy type `code` at `offset` of each payload (a view), shape (n,)."""
-    n, size = payloads.shape
-    return np.ndarray((n,), code, payloads.data, offset, (size,))
+def numbers_at(buffer: Bytes, starts: Ints, code: str) -> NDArray[Any]:
+    """The values of numpy type `code` that begin at each of `starts`, aligned or not, shape (n,)."""
+    windows: NDArray[Any] = np.ndarray((len(buffer) - np.dtype(code).itemsize + 1,), code, buffer, strides=(1,))
+    return np.asarray(windows[starts])
 
 
-def _has_layout(payloads: Bytes, layout: Layout) -> NDArray[np.bool_]:
-    """Which messages have a layout that fits their size?"""
-    word = "<u4" if layout.head[1] else ">u4"
-    same = values_at(payloads, 0, "<u2") == int.from_bytes(layout.head, "little")
+def values_at(messages: Bytes, offset: int, code: str) -> NDArray[Any]:
+    """The value of numpy type `code` at `offset` of each message of shape (n, size); a view, shape (n,)."""
+    n, size = messages.shape
+    values: NDArray[Any] = np.ndarray((n,), code, messages.data, offset, (size,))
+    return values
+
+
+def _has_layout(messages: Bytes, layout: Layout) -> NDArray[np.bool_]:
+    """Which messages have this layout? Their size, shape (n, size), must fit it."""
+    word = layout.order + "u4"
+    same = values_at(messages, LEAD, "<u2") == layout.head
     if len(layout.guards) > 16:
-        n, size = payloads.shape
-        words = np.ndarray((n, size - 3), word, payloads.data, strides=(size, 1))
+        n, size = messages.shape
+        words: NDArray[Any] = np.ndarray((n, size - 3), word, messages.data, strides=(size, 1))
         return np.asarray(same & (words[:, layout.guards] == layout.lengths).all(axis=1))
     for offset, length in zip(layout.guards.tolist(), layout.lengths.tolist(), strict=True):
-        same &= values_at(payloads, offset, word) == length
+        same &= values_at(messages, offset, word) == length
     return np.asarray(same)

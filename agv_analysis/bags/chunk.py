@@ -1,37 +1,27 @@
-"""Chunks: from the record in the file to the messages in it."""
+"""Chunks: from a record in the file, sound or not, to the messages in it."""
 
 from __future__ import annotations
 
-import struct
+import re
 import zlib
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.batch import Bytes, Ints
-from agv_analysis.bags.compression import inflate
+from agv_analysis.bags.batch import Bytes, Ints, numbers_at
+from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
 from agv_analysis.bags.errors import DamagedError
-from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Cursor
+from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Read, has_shape, is_known
 
-_HEAD = struct.Struct("<QQQI")
-"""First and last log time, inflated size, CRC of the inflated content."""
-
-
-class Chunk(NamedTuple):
-    """A chunk as it lies in the file."""
-
-    size: int
-    """Bytes of its content when inflated."""
-    crc: int
-    """Of the inflated content; 0: none."""
-    compression: str
-    content: bytes
+_HEAD = 8 + 8 + 8 + 4
+"""Bytes of a chunk record before the name of its compression."""
 
 
 class Messages(NamedTuple):
-    """Messages in a buffer, in file order."""
+    """Messages in a buffer, in the order in which they lie there."""
 
     starts: Ints
     """Where their records begin, shape (n,)."""
@@ -48,110 +38,241 @@ class Definition(NamedTuple):
     content: bytes
 
 
-def parse_chunk(content: bytes) -> Chunk:
-    """Chunk record. Raises DamagedError."""
-    cursor = Cursor(content)
-    _, _, size, crc = _HEAD.unpack(cursor.take(_HEAD.size))
-    chunk = Chunk(size, crc, cursor.text(), cursor.block(8))
-    cursor.end()
-    return chunk
+class Content(NamedTuple):
+    """What is in a chunk."""
+
+    messages: Messages
+    definitions: list[Definition]
+    lost: int
+    """Bytes that are no whole record."""
+
+
+# -- from the record to its content -----------------------------------------------------------------------------------
 
 
 def open_chunk(chunk: Chunk) -> bytes:
-    """Content of a chunk, checked against its CRC where it has one. Raises DamagedError."""
-    content = inflate(chunk.compression, chunk.content, chunk.size)
-    if chunk.crc and zlib.crc32(content) != chunk.crc:
-        raise DamagedError("its content does not match its CRC")
-    if len(content) != chunk.size:
-        raise DamagedError(f"it inflates to {len(content)} bytes where {chunk.size} are declared")
+    """Content of a chunk, checked against its CRC where it has one.
+
+    Where the CRC proves the content, it may have another compression or size than the record says. Raises DamagedError.
+    """
+    try:
+        content = inflate(chunk.compression, chunk.content, chunk.size)
+        if chunk.crc and zlib.crc32(content) != chunk.crc:
+            raise DamagedError("its content does not match its CRC")
+        if not chunk.crc and len(content) != chunk.size:
+            raise DamagedError(f"it inflates to {len(content)} bytes where {chunk.size} are declared")
+    except DamagedError:
+        if not chunk.crc:
+            raise
+        compression = compression_of(chunk.content)
+        size = declared_size(compression, chunk.content) if compression else len(chunk.content)
+        content = inflate_start(compression, chunk.content, min(MAX_CHUNK, size or chunk.size))
+        if zlib.crc32(content) != chunk.crc:
+            raise
     return content
 
 
-def find_messages(content: Bytes, index: list[Ints]) -> tuple[Messages, list[Definition]] | None:
-    """The messages of a chunk at the places that its message indexes name; None if these are not exactly its messages.
+def is_as_declared(chunk: Chunk, content: bytes) -> bool:
+    """Does the record say of the content what is true?"""
+    return chunk.size == len(content) and chunk.compression == compression_of(chunk.content)
+
+
+def rescue_chunk(length: int, left: int, read: Read) -> tuple[Chunk, int] | None:
+    """A chunk whose record's lengths contradict each other, and its true length; None if there is none.
+
+    `length` is what the record says of its own length, `left` what the file holds from its content on, which `read`
+    gives. A way to read the lengths counts if the CRC proves what comes out, or, where there is no CRC, if that fills
+    the declared size and consists of whole records.
+    """
+    for head, begin, end in _readings(length, left, read):
+        chunk = head._replace(content=read(begin, end - begin))
+        try:
+            inflated = open_chunk(chunk)
+        except DamagedError:
+            continue
+        if chunk.crc or (inflated and not walk(inflated).lost):
+            return chunk, end
+    return None
+
+
+def _readings(length: int, left: int, read: Read) -> Iterator[tuple[Chunk, int, int]]:
+    """Ways to read a chunk's record without believing one of its lengths: the chunk, where its content begins, ends."""
+    fixed = read(0, _HEAD + 4)
+    size, crc = int.from_bytes(fixed[16:24], "little"), int.from_bytes(fixed[24:28], "little")
+    name_length = int.from_bytes(fixed[_HEAD:], "little")
+    for name in NAMES:
+        begin = _HEAD + 4 + len(name) + 8
+        is_named = name != "" and read(_HEAD + 4, len(name)) == name.encode()
+        if not (is_named or name_length == len(name)):
+            continue
+        inner = begin + int.from_bytes(read(begin - 8, 8), "little")
+        for end in dict.fromkeys((inner, length)):
+            if begin <= end <= min(left, MAX_CHUNK):
+                yield Chunk(size, crc, name, b""), begin, end
+
+
+def cut_chunk(length: int, left: int, read: Read) -> bytes | None:
+    """What can be inflated of a chunk within which the file ends; None if this is no such chunk.
+
+    The record's length and the one inside it must agree to go beyond the end: a flipped bit does not look like this.
+    """
+    fixed = read(0, _HEAD + 4)
+    name_length = int.from_bytes(fixed[_HEAD:], "little")
+    begin = _HEAD + 4 + name_length + 8
+    if name_length > 4 or begin > left:
+        return None
+    name = read(_HEAD + 4, name_length).decode("latin-1")
+    if name not in NAMES or begin + int.from_bytes(read(begin - 8, 8), "little") != length or length <= left:
+        return None
+    size = int.from_bytes(fixed[16:24], "little")
+    try:
+        return inflate_start(name, read(begin, MAX_CHUNK), min(size, MAX_CHUNK))
+    except DamagedError:
+        return b""
+
+
+# -- from the content to its messages ---------------------------------------------------------------------------------
+
+
+def find(content: bytes, index: list[Ints]) -> Content | None:
+    """Messages of a chunk at the places that its message indexes name; None if these are not exactly its messages.
 
     The index is a hint and nothing more: its places must be those of message records, and together with records of
     other kinds they must fill the chunk without gap or overlap.
     """
-    if not index:
+    if not sum(map(len, index)):
         return None
+    buffer = np.frombuffer(content, np.uint8)
     starts = np.sort(np.concatenate(index))
-    size = len(content)
-    if not len(starts) or starts[0] < 0 or starts[-1] > size - MESSAGE_HEAD.size:
+    if starts[0] < 0 or starts[-1] > len(content) - RECORD.size - MESSAGE_HEAD:
         return None
-    messages = _at(content, starts)
-    if not (content[starts] == MESSAGE).all() or messages.lengths.min() < MESSAGE_HEAD.size - RECORD.size:
+    messages = messages_at(buffer, starts)
+    if not (buffer[starts] == MESSAGE).all() or messages.lengths.min() < MESSAGE_HEAD:
         return None
     begins = np.concatenate(([0], starts + RECORD.size + messages.lengths))
-    ends = np.concatenate((starts, [size]))
+    ends = np.concatenate((starts, [len(content)]))
     definitions: list[Definition] = []
     for gap in np.flatnonzero(begins != ends).tolist():
-        if begins[gap] > ends[gap]:
-            return None
-        found, end = _definitions(content[begins[gap] : ends[gap]].tobytes())
-        if end != ends[gap] - begins[gap]:
+        found = _definitions(content, int(begins[gap]), int(ends[gap]))
+        if found is None:
             return None
         definitions += found
-    return messages, definitions
+    return Content(messages, definitions, 0)
 
 
-def _definitions(content: bytes) -> tuple[list[Definition], int]:
-    """Records other than messages, up to the first message or to what is no record; and where that begins."""
-    found, position = [], 0
-    while position + RECORD.size <= len(content):
+def _definitions(content: bytes, position: int, end: int) -> list[Definition] | None:
+    """Records from `position` to `end`; None if these are not whole records, or if there is a message among them."""
+    found = []
+    while position + RECORD.size <= end:
         opcode, length = RECORD.unpack_from(content, position)
-        end = position + RECORD.size + length
-        if opcode == MESSAGE or opcode == 0 or end > len(content):
+        if opcode == MESSAGE:
             break
-        found.append(Definition(opcode, content[position + RECORD.size : end]))
-        position = end
-    return found, position
+        position += RECORD.size + length
+        found.append(Definition(opcode, content[position - length : min(position, end)]))
+    return found if position == end else None
 
 
-def walk_messages(content: bytes) -> tuple[Messages, list[Definition], int]:
-    """As `find_messages` without an index: from record to record; and where the last whole record ends."""
+def walk(content: bytes) -> Content:
+    """Messages of a chunk without its index, from record to record; what is no record is passed over."""
     starts: list[int] = []
     definitions: list[Definition] = []
-    position, end, unpack = 0, len(content), RECORD.unpack_from
-    while position + RECORD.size <= end:
+    position, lost = 0, 0
+    while position < len(content):
+        run, position = run_of_messages(content, position)
+        starts += run
+        if position == len(content):
+            break
+        definition = _definition(content, position)
+        if definition is not None:
+            definitions.append(definition)
+            position += RECORD.size + len(definition.content)
+            continue
+        suspect = run[-1] if run else None
+        after = next_message(content, position if suspect is None else suspect)
+        if suspect is not None and is_wrong_length(suspect, position, after):
+            position = starts.pop()
+        lost += after - position
+        position = after
+    return Content(messages_at(np.frombuffer(content, np.uint8), np.array(starts, np.int64)), definitions, lost)
+
+
+def run_of_messages(content: bytes, position: int) -> tuple[list[int], int]:
+    """Where the messages from `position` on begin that follow each other without gap, and where the last one ends."""
+    starts: list[int] = []
+    end, unpack = len(content) - RECORD.size, RECORD.unpack_from
+    while position <= end:
         opcode, length = unpack(content, position)
         after = position + RECORD.size + length
-        if after > end or opcode == 0 or (opcode == MESSAGE and length < MESSAGE_HEAD.size - RECORD.size):
+        if opcode != MESSAGE or length < MESSAGE_HEAD or after > len(content):
             break
-        if opcode == MESSAGE:
-            starts.append(position)
-        else:
-            definitions.append(Definition(opcode, content[position + RECORD.size : after]))
+        starts.append(position)
         position = after
-    return _at(np.frombuffer(content, np.uint8), np.array(starts, np.int64)), definitions, position
+    return starts, position
 
 
-def _at(content: Bytes, starts: Ints) -> Messages:
-    lengths = numbers_at(content, starts + 1, "<i8")
-    return Messages(starts, lengths, numbers_at(content, starts + RECORD.size, "<u2"))
+def _definition(content: bytes, position: int) -> Definition | None:
+    """The record, other than a message, at `position`; None if there is no whole one."""
+    if position + RECORD.size > len(content):
+        return None
+    opcode, length = RECORD.unpack_from(content, position)
+    begin = position + RECORD.size
+    if opcode == MESSAGE or not is_known(opcode) or begin + length > len(content):
+        return None
+    if not has_shape(opcode, length, lambda offset, count: content[begin + offset : begin + offset + count]):
+        return None
+    return Definition(opcode, content[begin : begin + length])
 
 
-def numbers_at(content: Bytes, starts: Ints, code: str) -> NDArray[Any]:
-    """Numbers of numpy type `code` at any places of a buffer, shape of `starts`."""
+_MESSAGE_START = re.compile(rb"(?=\x05.{5}\x00{3})", re.DOTALL)
+
+
+def next_message(content: bytes, position: int) -> int:
+    """Where the next message after `position` begins that is followed by another or by the end; else the end."""
+    for found in _MESSAGE_START.finditer(content, position + 1):
+        if _is_message(content, found.start()):
+            return found.start()
+    return len(content)
+
+
+def _is_message(content: bytes, position: int) -> bool:
+    """Is there a whole message at `position` and behind it another one, or the end?"""
+    for _ in range(2):
+        if position == len(content):
+            break
+        if position + RECORD.size > len(content):
+            return False
+        opcode, length = RECORD.unpack_from(content, position)
+        position += RECORD.size + length
+        if opcode != MESSAGE or length < MESSAGE_HEAD or position > len(content):
+            return False
+    return True
+
+
+def is_wrong_length(start: int, end: int, after: int) -> bool:
+    """Is the message from `start` to `end`, behind which there is no record, probably longer or shorter than it says?
+
+    `after` is where the next record was found: within the message, or at a place that one flipped bit of the message's
+    length would lead to.
+    """
+    length = end - start - RECORD.size
+    return after < end or bin(length ^ (after - start - RECORD.size)).count("1") == 1
+
+
+def messages_at(buffer: Bytes, starts: Ints) -> Messages:
+    """The messages whose records begin at `starts`."""
     if not len(starts):
-        return np.empty(0, code)
-    windows: NDArray[Any] = np.ndarray((len(content) - np.dtype(code).itemsize + 1,), code, content, strides=(1,))
-    return windows[starts]
-
-
-def parse_index(content: bytes) -> Ints:
-    """Places in its chunk that a MessageIndex record names. Raises DamagedError."""
-    cursor = Cursor(content)
-    cursor.take(2)
-    entries = cursor.block()
-    cursor.end()
-    if len(entries) % 16:
-        raise DamagedError("a message index whose entries have no whole length")
-    return np.frombuffer(entries, "<i8")[1::2]
+        return Messages(starts, starts, np.empty(0, np.uint16))
+    lengths = numbers_at(buffer, starts + 1, "<i8")
+    return Messages(starts, lengths, numbers_at(buffer, starts + RECORD.size, "<u2"))
 
 
 def by_channel(messages: Messages) -> Iterator[tuple[int, Messages]]:
     """The messages of each channel."""
-    for channel in np.unique(messages.channels).tolist():
-        mine = np.flatnonzero(messages.channels == channel)
-        yield channel, Messages(messages.starts[mine], messages.lengths[mine], messages.channels[mine])
+    order = np.argsort(messages.channels, kind="stable")
+    channels = messages.channels[order]
+    starts, lengths = messages.starts[order], messages.lengths[order]
+    bounds = [0, *(np.flatnonzero(channels[1:] != channels[:-1]) + 1).tolist(), len(channels)]
+    for begin, end in pairwise(bounds):
+        if end > begin:
+            mine = slice(begin, end)
+            yield int(channels[begin]), Messages(starts[mine], lengths[mine], channels[mine])

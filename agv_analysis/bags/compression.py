@@ -1,4 +1,4 @@
-"""Inflating the chunks of a bag, never beyond what they declare."""
+"""Inflating the chunks of a bag, never beyond a given size."""
 
 from __future__ import annotations
 
@@ -7,42 +7,90 @@ from collections.abc import Callable
 from agv_analysis.bags.errors import DamagedError
 
 MAX_CHUNK = 2**30
-"""Most bytes [B] that one chunk may inflate to: a thousand times what ROS 2 writes."""
+"""Most bytes that one chunk may inflate to: a thousand times what ROS 2 writes."""
+
+NAMES = ("", "zstd", "lz4")
+"""Compressions of the MCAP registry."""
+
+_MAGICS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
 
 
 def inflate(compression: str, content: bytes, size: int) -> bytes:
     """Content of a chunk that declares to have `size` bytes; the result may be shorter, never longer.
 
-    Raises DamagedError if the content is not what it is said to be, or if the size is beyond MAX_CHUNK.
+    Raises DamagedError if the content is not what it is said to be, if there is more of it, or if the size is beyond
+    MAX_CHUNK.
     """
     if size > MAX_CHUNK:
-        raise DamagedError(f"{size} bytes declared, at most {MAX_CHUNK} are inflated")
-    if compression not in _INFLATE:
-        raise DamagedError(f"compression {compression[:20]!r}, known are {', '.join(filter(None, _INFLATE))}")
-    return _INFLATE[compression](content, size)
+        raise DamagedError(f"{size} bytes are declared, at most {MAX_CHUNK} are inflated")
+    if compression not in NAMES:
+        raise DamagedError(f"compression {compression[:20]!r} is not known; known are zstd, lz4 and none")
+    if not content and not size:
+        return b""
+    if declared_size(compression, content) == size:
+        return _whole_zstd(content)
+    inflated = inflate_start(compression, content, size + 1)
+    if len(inflated) > size:
+        raise DamagedError(f"it holds more than the {size} bytes that are declared")
+    return inflated
 
 
-def _copy(content: bytes, size: int) -> bytes:
-    if len(content) > size:
-        raise DamagedError(f"{len(content)} bytes where {size} are declared")
-    return content
+def inflate_start(compression: str, content: bytes, limit: int) -> bytes:
+    """As much of a content as can be inflated, `limit` bytes at most: all of it, or what a cut has left.
+
+    Raises DamagedError if the content is not what it is said to be.
+    """
+    if not compression:
+        return content[:limit]
+    read, error = _READERS[compression](content)
+    parts = []
+    try:
+        while limit > 0 and (part := read(limit)):
+            parts.append(part)
+            limit -= len(part)
+    except error as problem:
+        raise DamagedError(f"{compression}: {problem}") from None
+    return b"".join(parts)
 
 
-def _zstd(content: bytes, size: int) -> bytes:
+def declared_size(compression: str, content: bytes) -> int | None:
+    """Size that a zstd frame itself declares, None if it does not. Raises DamagedError if it is no such frame."""
+    if compression != "zstd":
+        return None
     import zstandard
 
     try:
-        frame = zstandard.get_frame_parameters(content)
-        if frame.content_size == size and size:
-            return zstandard.ZstdDecompressor(max_window_size=0).decompress(content)
-        # A frame of unknown or other length: read on, but not beyond what is declared.
-        with zstandard.ZstdDecompressor().stream_reader(content) as reader:
-            return _at_most(reader.read, size)
+        size = zstandard.get_frame_parameters(content).content_size
+    except zstandard.ZstdError as error:
+        raise DamagedError(f"zstd: {error}") from None
+    return None if size == zstandard.CONTENTSIZE_UNKNOWN else int(size)
+
+
+def compression_of(content: bytes) -> str:
+    """Compression by what the content begins with."""
+    return next((name for name, magic in _MAGICS.items() if content.startswith(magic)), "")
+
+
+def _whole_zstd(content: bytes) -> bytes:
+    """In one go, which is the fastest; what it allocates is the frame's own declaration, checked before."""
+    import zstandard
+
+    try:
+        return zstandard.ZstdDecompressor().decompress(content)
     except zstandard.ZstdError as error:
         raise DamagedError(f"zstd: {error}") from None
 
 
-def _lz4(content: bytes, size: int) -> bytes:
+_Reader = tuple[Callable[[int], bytes], type[Exception]]
+
+
+def _zstd(content: bytes) -> _Reader:
+    import zstandard
+
+    return zstandard.ZstdDecompressor().stream_reader(content, read_across_frames=True).read, zstandard.ZstdError
+
+
+def _lz4(content: bytes) -> _Reader:
     import lz4.frame
 
     frame, pending = lz4.frame.LZ4FrameDecompressor(), [content]
@@ -50,24 +98,7 @@ def _lz4(content: bytes, size: int) -> bytes:
     def read(limit: int) -> bytes:
         return b"" if frame.eof else bytes(frame.decompress(pending.pop() if pending else b"", limit))
 
-    try:
-        return _at_most(read, size)
-    except (RuntimeError, EOFError) as error:
-        raise DamagedError(f"lz4: {error}") from None
+    return read, RuntimeError
 
 
-def _at_most(read: Callable[[int], bytes], size: int) -> bytes:
-    """All that there is to read; raises DamagedError if it is more than `size` bytes."""
-    parts, left = [], size + 1
-    while left:
-        part = read(left)
-        if not part:
-            break
-        parts.append(part)
-        left -= len(part)
-    if not left:
-        raise DamagedError(f"more than the {size} bytes that are declared")
-    return b"".join(parts)
-
-
-_INFLATE: dict[str, Callable[[bytes, int], bytes]] = {"": _copy, "zstd": _zstd, "lz4": _lz4}
+_READERS: dict[str, Callable[[bytes], _Reader]] = {"zstd": _zstd, "lz4": _lz4}

@@ -22,10 +22,15 @@ from numpy.typing import NDArray
 from agv_analysis.bags.errors import UndecodableError
 from agv_analysis.bags.schema import STRING, Member, Struct
 
-HEADER = 4
-"""Bytes of the encapsulation header, before the first member."""
+LEAD = 16
+"""Bytes before a message: log time and publish time [ns], little-endian, as in MCAP's message records."""
+
+BODY = LEAD + 4
+"""Where the first member begins, after the encapsulation header of 4 bytes."""
 
 _END_PADDING = 3
+
+LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
 
 Index = tuple[int, ...]
 
@@ -40,31 +45,32 @@ class Leaf:
     block: int | None
     """Values side by side that belong to the last dimension of the column, None for a single value."""
     offsets: list[int] = field(default_factory=list)
-    """Where the values, or blocks, begin, counted from the encapsulation header's first byte."""
+    """Where the values, or blocks, begin, counted from the lead's first byte."""
     indices: list[Index] = field(default_factory=list)
     """Their places in the column, one index for each array around them."""
 
 
 @dataclass
 class Layout:
-    """Where the values of a message lie."""
+    """Where the values of a message lie; all offsets count from the first byte of its lead."""
 
-    size: int
-    """Bytes of the message without padding at its end."""
-    head: bytes
-    """Encapsulation: the first two bytes of the message."""
+    head: int
+    """Encapsulation: the first two bytes after the lead, as a little-endian number."""
+    order: str
+    """Byte order that it stands for, "<" or ">"."""
     guards: NDArray[np.int64]
     """Offsets of the length words, shape (G,)."""
     lengths: NDArray[np.uint32]
     """What is in them, shape (G,)."""
     leaves: tuple[Leaf, ...]
+    """In the order of the wire."""
     counts: dict[str, dict[Index, int]]
     """Lengths of the sequences, by path and place."""
 
     @property
     def key(self) -> bytes:
         """Equal for equal layouts of messages of one type."""
-        return self.head + self.guards.tobytes() + self.lengths.tobytes()
+        return self.order.encode() + self.guards.tobytes() + self.lengths.tobytes()
 
 
 def length_path(path: str) -> str:
@@ -72,38 +78,42 @@ def length_path(path: str) -> str:
     return f"len({path})"
 
 
-def trace(kind: Struct, payload: bytes) -> Layout:
-    """Layout of one message, encapsulation header included.
+def trace(kind: Struct, message: bytes) -> Layout:
+    """Layout of one message: its lead, the encapsulation header, its members.
 
     Raises UndecodableError if the bytes cannot be a message of this type.
     """
-    if len(payload) < HEADER:
-        raise UndecodableError(f"{len(payload)} bytes are too few for a CDR message")
-    if payload[0] != 0 or payload[1] > 1:
-        raise UndecodableError(f"its encapsulation is {payload[:2].hex()}; only CDR, 0000 and 0001, is read")
-    walk = _Trace(payload)
+    size = len(message) - LEAD
+    if size < BODY - LEAD:
+        raise UndecodableError(f"{size} bytes are too few for a CDR message")
+    if message[LEAD] != 0 or message[LEAD + 1] > 1:
+        head = message[LEAD : LEAD + 2].hex()
+        raise UndecodableError(f"its encapsulation is {head}; only plain CDR, 0000 and 0001, is read")
+    walk = _Trace(message)
     walk.struct(kind, "", ())
-    rest = len(payload) - HEADER - walk.position
+    rest = len(message) - BODY - walk.position
     if rest > _END_PADDING:
-        raise UndecodableError(f"{rest} bytes are left over after its last member")
+        raise UndecodableError(f"{rest} of its {size} bytes are left over after the last member")
     return Layout(
-        HEADER + walk.position, payload[:2], np.array(walk.guards, np.int64), np.array(walk.lengths, np.uint32),
-        tuple(walk.leaves.values()), walk.counts,
+        message[LEAD] | message[LEAD + 1] << 8, walk.order, np.array(walk.guards, np.int64),
+        np.array(walk.lengths, np.uint32), tuple(walk.leaves.values()), walk.counts,
     )  # fmt: skip
 
 
 class _Trace:
     """The walk through one message; `position` counts from the end of the encapsulation header."""
 
-    def __init__(self, payload: bytes) -> None:
-        self._payload = payload
-        self._order = "<" if payload[1] else ">"
-        self._end = len(payload) - HEADER
+    def __init__(self, message: bytes) -> None:
+        self._message = message
+        self._end = len(message) - BODY
+        self.order = "<" if message[LEAD + 1] else ">"
         self.position = 0
         self.guards: list[int] = []
         self.lengths: list[int] = []
         self.leaves: dict[tuple[str, str, int | None], Leaf] = {}
         self.counts: dict[str, dict[Index, int]] = {}
+        self._add(LOG_TIME, "<i8", None, (), 0)
+        self._add(PUBLISH_TIME, "<i8", None, (), 8)
 
     def struct(self, kind: Struct, prefix: str, index: Index) -> None:
         """Walk through the members of a struct, those of an array's elements at `index`."""
@@ -130,7 +140,7 @@ class _Trace:
     def _word(self, path: str) -> int:
         """A length word; it can never exceed the bytes that follow it."""
         offset = self._take(path, 4, 4)
-        (value,) = struct.unpack_from(self._order + "I", self._payload, offset)
+        (value,) = struct.unpack_from(self.order + "I", self._message, offset)
         self.guards.append(offset)
         self.lengths.append(value)
         if value > self._end - self.position:
@@ -141,9 +151,9 @@ class _Trace:
         """Offset of the next `size` bytes."""
         begin = self.position + -self.position % alignment
         if begin + size > self._end:
-            raise UndecodableError(f"it ends after {len(self._payload)} bytes, before the end of {path}")
+            raise UndecodableError(f"it ends after {len(self._message) - LEAD} bytes, before the end of {path}")
         self.position = begin + size
-        return HEADER + begin
+        return BODY + begin
 
     def _add(self, path: str, code: str, block: int | None, index: Index, offset: int) -> None:
         leaf = self.leaves.get((path, code, block))
@@ -157,18 +167,18 @@ class _Trace:
         if count == 0:
             return
         offset = self._take(path, size, size * (1 if count is None else count))
-        self._add(path, ("u1" if code == "?" else self._order + code), count, index, offset)
+        self._add(path, ("u1" if code == "?" else self.order + code), count, index, offset)
 
     def _strings(self, path: str, count: int | None, index: Index) -> None:
         for place in [index] if count is None else ((*index, i) for i in range(count)):
             length = self._word(path)
             if length == 0:  # without its final zero: the zeros of the length word are as good
-                self._add(path, "S1", None, place, HEADER + self.position - 4)
+                self._add(path, "S1", None, place, BODY + self.position - 4)
             else:
                 self._add(path, f"S{max(1, length - 1)}", None, place, self._take(path, 1, length))
 
     def _structs(self, kind: Struct, prefix: str, count: int, index: Index) -> None:
         if count > self._end - self.position:
-            raise UndecodableError(f"it ends after {len(self._payload)} bytes, before the end of {prefix[:-1]}")
+            raise UndecodableError(f"it ends after {len(self._message) - LEAD} bytes, before the end of {prefix[:-1]}")
         for i in range(count):
             self.struct(kind, prefix, (*index, i))

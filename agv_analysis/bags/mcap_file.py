@@ -1,31 +1,57 @@
-"""One MCAP file -> its messages, batch by batch, with everything that is wrong with it."""
+"""One MCAP file -> its messages, batch by batch, and everything that is wrong with it.
+
+Theory of operation. The file is read once, from its first record to its last; no index is needed for that, nor is one
+believed. Each record must have the lengths inside it add up to its own. Where one does not, the chunk that it may be
+is tried first (`rescue_chunk`), then the next record is searched for, and what lies between is reported. What a CRC
+covers is used only if it matches; what none covers is used and reported as not checked. Message indexes are hints for
+finding the messages of a chunk fast (`chunk.find`). Definitions of topics are taken from the place that a CRC covers,
+where there is one: the summary at the end of the file repeats those of the chunks.
+
+Chunks are inflated and checked on a thread of their own, a few ahead of the messages being sorted out: both let go of
+Python's lock.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import zlib
+from collections import Counter, deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from agv_analysis.bags.batch import Batch, Bytes, Ints
 from agv_analysis.bags.chunk import (
+    Content,
     Definition,
     Messages,
     by_channel,
-    find_messages,
-    numbers_at,
+    cut_chunk,
+    find,
+    is_as_declared,
+    is_wrong_length,
+    messages_at,
     open_chunk,
-    parse_chunk,
-    parse_index,
-    walk_messages,
+    rescue_chunk,
+    run_of_messages,
+    walk,
 )
+from agv_analysis.bags.compression import MAX_CHUNK
+from agv_analysis.bags.definitions import Definitions
 from agv_analysis.bags.errors import BagError, DamagedError
 from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.layout import LEAD
 from agv_analysis.bags.records import (
+    ATTACHMENT,
     CHANNEL,
     CHUNK,
+    DATA_END,
+    DATA_END_SIZE,
     FOOTER,
     FOOTER_SIZE,
+    HEADER,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
@@ -34,169 +60,380 @@ from agv_analysis.bags.records import (
     RECORD,
     SCHEMA,
     STATISTICS,
+    Attachment,
     Channel,
+    Chunk,
+    Footer,
     Schema,
     Statistics,
-    parse_channel,
+    has_shape,
+    is_known,
+    parse_attachment,
+    parse_chunk,
     parse_footer,
+    parse_index,
     parse_metadata,
-    parse_schema,
     parse_statistics,
 )
+from agv_analysis.bags.source import Record, Source
+from agv_analysis.bags.storage import IsWanted
 
 _WINDOW = 2**20
+_AHEAD = 4
+_AHEAD_BYTES = 2**26
+"""Chunks, and bytes of them, that may be inflated ahead."""
+
+_MAX_DAMAGES = 10_000
+"""So many damaged places are passed over in a file."""
+
+
+class _Run(NamedTuple):
+    """Messages outside of any chunk that follow each other."""
+
+    position: int
+    content: bytes
+    starts: list[int]
+
+
+class _Packed(NamedTuple):
+    """A chunk."""
+
+    position: int
+    chunk: Chunk
+    places: list[Ints]
+    """Of its messages, as its message indexes name them."""
+
+
+class _Cut(NamedTuple):
+    """What is left of a chunk within which the file ends."""
+
+    position: int
+    content: bytes
 
 
 class McapFile:
-    """Reads one MCAP file from its first record to its last."""
+    """Reads one MCAP file. Everything but the batches is complete only after these have been read."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, keep_attachments: bool = False) -> None:
+        """Open the file. Raises BagError if it cannot be read or is no MCAP file."""
         self.path = path
         self.findings = Findings()
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
         self.metadata: dict[str, dict[str, str]] = {}
+        self.attachments: list[Attachment] = []
         self.statistics: Statistics | None = None
-        self.found: dict[int, int] = {}
-        """Messages found so far by channel."""
-        try:
-            self._file = path.open("rb")
-            self._size = path.stat().st_size
-        except OSError as error:
-            raise BagError(f"{path}: cannot be read: {error.strerror}") from None
-        begin = self._read(0, len(MAGIC))
-        if begin != MAGIC:
-            found = f"begins with {begin.hex(' ')}" if begin else "is empty"
-            raise BagError(f"{path}: {found}; an MCAP file begins with {MAGIC.hex(' ')}")
+        self.counts: Counter[int] = Counter()
+        """Messages found by channel."""
+        self.position = 0
+        """How far the file has been read [B]."""
+        self._keep_attachments = keep_attachments
+        self._definitions = Definitions(self.findings)
+        self._is_proven = False
+        self._damages = 0
+        self._source = Source(path)
+        self._check_magic()
         self._read_summary()
+
+    @property
+    def schemas(self) -> dict[int, Schema]:
+        """Schemas by number."""
+        return self._definitions.schemas
+
+    @property
+    def channels(self) -> dict[int, Channel]:
+        """Channels by number."""
+        return self._definitions.channels
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self._source.size
+
+    def expected(self, channel: int) -> int:
+        """Messages of a channel according to the file's statistics, 0 if it has none."""
+        return self.statistics.by_channel.get(channel, 0) if self.statistics else 0
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        self._source.close()
 
-    def _read(self, offset: int, count: int) -> bytes:
-        """Up to `count` bytes at `offset`; fewer at the end of the file."""
-        try:
-            self._file.seek(offset)
-            return self._file.read(max(0, min(count, self._size - offset)))
-        except OSError as error:
-            raise BagError(f"{self.path}: cannot be read at byte {offset}: {error.strerror}") from None
+    def batches(self, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
+        """The messages of all channels that are wanted, in file order, in batches of one channel. To be called once."""
+        for item, opened in _ahead(self._items()):
+            self.position = item.position
+            if isinstance(item, _Run):
+                if not self._is_proven:
+                    self.findings.add("message outside of chunks, which no CRC covers", len(item.starts))
+                buffer = np.frombuffer(item.content, np.uint8)
+                yield from self._split(buffer, messages_at(buffer, np.array(item.starts, np.int64)), is_wanted)
+            elif isinstance(item, _Cut):
+                yield from self._content(item.position, item.content, walk(item.content), False, is_wanted)
+            elif opened is not None:
+                yield from self._unpack(item, opened, is_wanted)
+        self.position = self.size
+        self._compare_with_statistics()
+
+    # -- beginning and end of the file -------------------------------------------------------------------------------
+
+    def _check_magic(self) -> None:
+        begin = self._source.read(0, len(MAGIC))
+        if begin == MAGIC:
+            return
+        if not begin:
+            raise BagError(f"{self.path}: is empty")
+        if not (self._source.is_record(len(MAGIC)) and self._source.head(len(MAGIC))[0] == HEADER):
+            raise BagError(f"{self.path}: is no MCAP file: begins with {begin.hex(' ')} instead of {MAGIC.hex(' ')}")
+        self.findings.add(f"file that begins with {begin.hex(' ')} instead of {MAGIC.hex(' ')}")
 
     def _read_summary(self) -> None:
-        end = self._size - len(MAGIC) - FOOTER_SIZE
-        try:
-            opcode, content = self._record(end)
-            footer = parse_footer(content) if opcode == FOOTER else None
-        except DamagedError:
-            footer = None
+        """Definitions and statistics from the end of the file, where they can be had before the first message."""
+        end = self._source.size - len(MAGIC) - FOOTER_SIZE
+        footer = self._footer(end)
         if footer is None:
-            self.findings.add("footer missing: the file was not closed, or cut", is_loss=True)
             return
-        position = footer.summary_start
-        while 0 < position < end:
+        begin = footer.summary_start or end
+        if not len(MAGIC) <= begin <= end:
+            self.findings.add("footer that points to no place in the file")
+            return
+        is_proven = footer.crc != 0
+        if is_proven and self._crc(begin, end + RECORD.size + 16) != footer.crc:
+            self.findings.add("summary that does not match its CRC, its statistics not used", at=begin)
+            is_proven = False
+        self._check_data_section(begin - DATA_END_SIZE)
+        for record in self._sound_records(begin, end):
+            if record.opcode == STATISTICS and (is_proven or not footer.crc):
+                self.statistics = parse_statistics(record.content)
+            self._define(Definition(record.opcode, record.content), is_proven)
+        if self.statistics is None:
+            self.findings.add("file without statistics, in which a missing message would not be noticed")
+
+    def _footer(self, position: int) -> Footer | None:
+        record = next(self._sound_records(position, position + 1), None)
+        if record is not None and record.opcode == FOOTER:
+            if self._source.read(record.end, len(MAGIC)) != MAGIC:
+                self.findings.add("file whose last eight bytes are not those of an MCAP file")
+            return parse_footer(record.content)
+        self.findings.add("file without an end: the recording was interrupted, or the file was cut", is_loss=True)
+        return None
+
+    def _sound_records(self, position: int, end: int) -> Iterator[Record]:
+        """Records from `position` on, up to `end` or to the first that is damaged."""
+        while len(MAGIC) <= position < end:
             try:
-                opcode, content = self._record(position)
+                record = self._source.record(position)
             except DamagedError:
                 return
-            self._define(Definition(opcode, content))
-            position += RECORD.size + len(content)
+            yield record
+            position = record.end
 
-    def _record(self, position: int) -> tuple[int, bytes]:
-        """Opcode and content of the record at `position`. Raises DamagedError."""
-        head = self._read(position, RECORD.size) if position > 0 else b""
-        if len(head) < RECORD.size:
-            raise DamagedError("the file ends")
-        opcode, length = RECORD.unpack(head)
-        if position + RECORD.size + length > self._size:
-            raise DamagedError(f"a record of {length} bytes where the file has {self._size - position} left")
-        return opcode, self._read(position + RECORD.size, length)
+    def _crc(self, begin: int, end: int) -> int:
+        crc = 0
+        for position in range(begin, end, _WINDOW):
+            crc = zlib.crc32(self._source.read(position, min(_WINDOW, end - position)), crc)
+        return crc
 
-    def _define(self, definition: Definition) -> None:
-        opcode, content = definition
-        try:
-            if opcode == SCHEMA:
-                schema = parse_schema(content)
-                self.schemas.setdefault(schema.id, schema)
-            elif opcode == CHANNEL:
-                channel = parse_channel(content)
-                self.channels.setdefault(channel.id, channel)
-            elif opcode == METADATA:
-                self.metadata.update([parse_metadata(content)])
-            elif opcode == STATISTICS:
-                self.statistics = parse_statistics(content)
-        except DamagedError as error:
-            self.findings.add(f"damaged record ({error})")
+    def _check_data_section(self, end: int) -> None:
+        """Compare the CRC over everything before the DataEnd record at `end`, if there is one."""
+        record = next(self._sound_records(end, end + 1), None)
+        if record is None or record.opcode != DATA_END or not any(record.content):
+            return
+        if self._crc(0, end) == int.from_bytes(record.content, "little"):
+            self._is_proven = True
+        else:
+            self.findings.add("data section that does not match its CRC", is_loss=True)
 
-    def batches(self, is_wanted: Callable[[Channel], bool]) -> Iterator[tuple[Channel, Batch]]:
-        """The messages of all channels that are wanted, in file order, in batches of one channel."""
-        position = len(MAGIC)
-        waiting: tuple[int, bytes] | None = None
-        index: list[Ints] = []
-        while position < self._size - len(MAGIC):
-            try:
-                opcode, content = self._record(position)
-            except DamagedError as error:
-                self.findings.add(f"not a record ({error})", at=position, is_loss=True)
-                break
-            if opcode == MESSAGE_INDEX:
-                index.append(parse_index(content))
-            elif waiting is not None:
-                yield from self._chunk(*waiting, index, is_wanted)
-                waiting, index = None, []
-            if opcode == CHUNK:
-                waiting = position, content
-            elif opcode == MESSAGE:
-                window = self._read(position, max(_WINDOW, RECORD.size + len(content)))
-                messages, _, _ = walk_messages(window)
-                yield from self._split(np.frombuffer(window, np.uint8), messages, is_wanted)
-                content = window[: int(messages.starts[-1] + messages.lengths[-1])]
+    def _compare_with_statistics(self) -> None:
+        if self.statistics is None:
+            return
+        for number, expected in self.statistics.by_channel.items():
+            channel = self.channels.get(number)
+            name = channel.topic if channel else f"channel {number}"
+            found = self.counts[number]
+            if found < expected:
+                what = f"{name}: message that the recorder counted and that is not there any more"
+                self.findings.add(what, expected - found, is_loss=True)
+            elif found > expected:
+                self.findings.add(f"{name}: message more than the recorder counted", found - expected)
+
+    # -- records -----------------------------------------------------------------------------------------------------
+
+    def _items(self) -> Iterator[_Run | _Packed | _Cut]:
+        """What holds messages, chunks together with their message indexes; all else is taken note of on the way."""
+        packed: _Packed | None = None
+        for item in self._records():
+            if isinstance(item, Record) and item.opcode == MESSAGE_INDEX and packed is not None:
+                self._take(item, packed)
+                continue
+            if packed is not None:
+                yield packed
+                packed = None
+            if isinstance(item, _Packed):
+                packed = item
+            elif isinstance(item, Record):
+                self._take(item, None)
             else:
-                self._define(Definition(opcode, content))
-            position += RECORD.size + len(content)
-        if waiting is not None:
-            yield from self._chunk(*waiting, index, is_wanted)
+                yield item
+        if packed is not None:
+            yield packed
 
-    def _chunk(
-        self, position: int, record: bytes, index: list[Ints], is_wanted: Callable[[Channel], bool]
-    ) -> Iterator[tuple[Channel, Batch]]:
+    def _take(self, record: Record, packed: _Packed | None) -> None:
+        """Take note of a record outside of chunks that holds no messages."""
         try:
-            chunk = parse_chunk(record)
-            content = open_chunk(chunk)
+            if record.opcode == MESSAGE_INDEX and packed is not None:
+                packed.places.append(parse_index(record.content))
+            elif record.opcode == METADATA:
+                name, content = parse_metadata(record.content)
+                self.metadata[name] = content
+                if not self._is_proven:
+                    self.findings.add("metadata record, which no CRC covers")
+            elif record.opcode == ATTACHMENT:
+                self._take_attachment(record)
+            else:
+                self._define(Definition(record.opcode, record.content), self._is_proven)
         except DamagedError as error:
-            number = sum(map(len, index))
-            self.findings.add(f"damaged chunk left out ({error})", at=position, messages=number, is_loss=True)
+            self.findings.add(f"damaged record, not used ({error})", at=record.position)
+
+    def _take_attachment(self, record: Record) -> None:
+        attachment, crc = parse_attachment(record.content)
+        if crc and zlib.crc32(record.content[:-4]) != crc:
+            self.findings.add("attachment that does not match its CRC, left out", at=record.position, is_loss=True)
+        elif self._keep_attachments:
+            self.attachments.append(attachment)
+
+    def _define(self, definition: Definition, is_proven: bool) -> None:
+        if definition.opcode in (SCHEMA, CHANNEL):
+            try:
+                self._definitions.add(definition, is_proven)
+            except DamagedError as error:
+                self.findings.add(f"damaged definition of a topic, not used ({error})")
+
+    def _records(self) -> Iterator[Record | _Run | _Packed | _Cut]:
+        """Everything sound in the file, in order; what is not is passed over and reported."""
+        position = len(MAGIC)
+        while not self._source.is_end(position):
+            item: Record | _Run | _Packed | _Cut | None
+            try:
+                item, position = self._next(position)
+            except DamagedError as error:
+                self._damages += 1
+                if self._damages > _MAX_DAMAGES:
+                    self.findings.add("rest of a file with too many damages, not read", at=position, is_loss=True)
+                    return
+                item, position = self._pass_over(position, str(error))
+            if item is not None:
+                yield item
+
+    def _next(self, position: int) -> tuple[Record | _Run | _Packed | None, int]:
+        """What is at `position`, and where it ends. Raises DamagedError."""
+        record = self._source.record(position)
+        if record.opcode == MESSAGE:
+            return self._run(record)
+        if record.opcode == CHUNK:
+            return _Packed(position, parse_chunk(record.content), []), record.end
+        if is_known(record.opcode):
+            return record, record.end
+        content = record.content
+        if has_shape(CHUNK, len(content), lambda at, count: content[at : at + count]):
+            self.findings.add("chunk under another opcode", at=position)
+            return _Packed(position, parse_chunk(content), []), record.end
+        if not (self._source.is_end(record.end) or self._source.is_record(record.end)):
+            raise DamagedError(f"a record of the unknown kind {record.opcode}")
+        self.findings.add(f"record of the unknown kind {record.opcode}, passed over", at=position)
+        return None, record.end
+
+    def _run(self, first: Record) -> tuple[_Run, int]:
+        """Messages outside of chunks, as many as follow each other within a window, and where the next record is."""
+        position = first.position
+        content = self._source.read(position, max(_WINDOW, first.end - position))
+        starts, length = run_of_messages(content, 0)
+        end = position + length
+        if self._source.is_end(end) or self._source.is_record(end, depth=0):
+            return _Run(position, content, starts), end
+        after = self._source.next_record(position + starts[-1])
+        if after is not None and is_wrong_length(position + starts[-1], end, after):
+            at = position + starts.pop()
+            self.findings.add("message of a wrong length, left out", at=at, messages=1, is_loss=True)
+            return _Run(position, content, starts), after
+        return _Run(position, content, starts), end
+
+    def _pass_over(self, position: int, why: str) -> tuple[_Packed | _Cut | None, int]:
+        """What can be made of a damaged place, and where the next record is."""
+        begin = position + RECORD.size
+        left = self._source.size - begin
+        head = self._source.read(position, RECORD.size)
+        if left > 0:
+            _, length = RECORD.unpack(head)
+
+            def read(at: int, count: int) -> bytes:
+                return self._source.read(begin + at, count)
+
+            rescued = rescue_chunk(length, left, read)
+            if rescued is not None:
+                self.findings.add("chunk whose lengths contradict each other, read all the same", at=position)
+                return _Packed(position, rescued[0], []), begin + rescued[1]
+            content = cut_chunk(length, left, read)
+            if content is not None:
+                self.findings.add("chunk within which the file ends", at=position, is_loss=True)
+                return _Cut(position, content), self._source.size
+        after = self._source.next_record(position)
+        if after is None:
+            self.findings.add(f"end of the file in which there is no record ({why})", at=position, is_loss=True)
+            return None, self._source.size
+        self.findings.add(f"damaged place, passed over ({why})", at=position, is_loss=True)
+        return None, after
+
+    # -- chunks ------------------------------------------------------------------------------------------------------
+
+    def _unpack(self, packed: _Packed, opened: Future[bytes], is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
+        chunk, position = packed.chunk, packed.position
+        try:
+            content = opened.result()
+        except DamagedError as error:
+            number = sum(map(len, packed.places))
+            self.findings.add(f"damaged chunk, left out ({error})", at=position, messages=number, is_loss=True)
             return
         if not chunk.crc:
-            self.findings.add("chunk without a CRC, not checked")
-        buffer = np.frombuffer(content, np.uint8)
-        found = find_messages(buffer, index)
+            self.findings.add("chunk without a CRC, whose content is not checked")
+        elif not is_as_declared(chunk, content):
+            self.findings.add("chunk that misstates its size or compression, read all the same", at=position)
+        found = find(content, packed.places)
         if found is None:
-            messages, definitions, end = walk_messages(content)
-            if end != len(content):
-                self.findings.add("chunk that ends in no record", at=position, is_loss=True)
-        else:
-            messages, definitions = found
-        for definition in definitions:
-            self._define(definition)
-        yield from self._split(buffer, messages, is_wanted)
+            found = walk(content)
+            if packed.places:
+                self.findings.add("message index that does not fit its chunk, not used", at=position)
+        yield from self._content(position, content, found, chunk.crc != 0, is_wanted)
 
-    def _split(
-        self, buffer: Bytes, messages: Messages, is_wanted: Callable[[Channel], bool]
+    def _content(
+        self, position: int, content: bytes, found: Content, is_proven: bool, is_wanted: IsWanted
     ) -> Iterator[tuple[Channel, Batch]]:
+        if found.lost:
+            self.findings.add("byte in a chunk that belongs to no whole record", found.lost, at=position, is_loss=True)
+        for definition in found.definitions:
+            self._define(definition, is_proven)
+        yield from self._split(np.frombuffer(content, np.uint8), found.messages, is_wanted)
+
+    def _split(self, buffer: Bytes, messages: Messages, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         for number, mine in by_channel(messages):
-            self.found[number] = self.found.get(number, 0) + len(mine.starts)
             channel = self.channels.get(number)
             if channel is None:
-                self.findings.add(
-                    f"message of channel {number}, which is not described", len(mine.starts), is_loss=True
-                )
-            elif is_wanted(channel):
-                yield channel, _batch(buffer, mine)
+                what = f"message of channel {number}, which is not described, left out"
+                self.findings.add(what, len(mine.starts), is_loss=True)
+                continue
+            self.counts[number] += len(mine.starts)
+            if is_wanted(channel):
+                lead = RECORD.size + MESSAGE_HEAD - LEAD
+                yield channel, Batch(buffer, mine.starts + lead, mine.lengths - (MESSAGE_HEAD - LEAD))
 
 
-def _batch(buffer: Bytes, messages: Messages) -> Batch:
-    head = MESSAGE_HEAD.size
-    starts = messages.starts
-    log_time = numbers_at(buffer, starts + head - 16, "<i8")
-    publish_time = numbers_at(buffer, starts + head - 8, "<i8")
-    return Batch(buffer, starts + head, messages.lengths - (head - RECORD.size), log_time, publish_time)
+def _ahead(items: Iterator[_Run | _Packed | _Cut]) -> Iterator[tuple[_Run | _Packed | _Cut, Future[bytes] | None]]:
+    """The same items, a few chunks ahead being opened on another thread."""
+    waiting: deque[tuple[_Run | _Packed | _Cut, Future[bytes] | None]] = deque()
+    with ThreadPoolExecutor(1, "bag") as pool:
+        for item in items:
+            opened = pool.submit(open_chunk, item.chunk) if isinstance(item, _Packed) else None
+            waiting.append((item, opened))
+            ahead = sum(min(item.chunk.size, MAX_CHUNK) for item, _ in waiting if isinstance(item, _Packed))
+            while waiting and (len(waiting) > _AHEAD or ahead > _AHEAD_BYTES):
+                item, opened = waiting.popleft()
+                ahead -= min(item.chunk.size, MAX_CHUNK) if isinstance(item, _Packed) else 0
+                yield item, opened
+        yield from waiting

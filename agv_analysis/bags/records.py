@@ -1,13 +1,19 @@
 """Records of an MCAP file: bytes -> values, every length checked before it is used.
 
 Source: https://mcap.dev/spec: a record is an opcode (1 byte), a length (8 bytes) and that many bytes; integers are
-little-endian; strings, maps and arrays are preceded by their length in bytes (4).
+little-endian; strings, maps and arrays are preceded by their length in bytes (4, or 8 for the content of chunks and
+attachments).
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.bags.errors import DamagedError
 
@@ -18,10 +24,42 @@ RECORD = struct.Struct("<BQ")
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 9, 10, 11, 12, 13, 14, 15
 
-MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-"""Opcode, length, channel, sequence, log time, publish time; the payload follows."""
+MESSAGE_HEAD = 22
+"""Bytes of a message record before its payload: channel (2), sequence (4), log time (8), publish time (8)."""
 
 FOOTER_SIZE = RECORD.size + 20
+DATA_END_SIZE = RECORD.size + 4
+
+Read = Callable[[int, int], bytes]
+"""Up to so many bytes (second argument) from a place (first), fewer at the end."""
+
+_SHAPES = {
+    HEADER: "bb", FOOTER: "884", SCHEMA: "2bbb", CHANNEL: "22bbb", CHUNK: "8884bB", MESSAGE_INDEX: "2b",
+    CHUNK_INDEX: "8888b8b88", ATTACHMENT: "88bbB4", ATTACHMENT_INDEX: "88888bb", STATISTICS: "82444488b",
+    METADATA: "bb", METADATA_INDEX: "88b", SUMMARY_OFFSET: "188", DATA_END: "4",
+}  # fmt: skip
+"""Parts of each kind of record: so many bytes, or a block after its length of 4 (b) or 8 (B) bytes."""
+
+
+def is_known(opcode: int) -> bool:
+    """Is this the opcode of a record that is read here?"""
+    return opcode == MESSAGE or opcode in _SHAPES
+
+
+def has_shape(opcode: int, length: int, read: Read) -> bool:
+    """Do the lengths inside a record of a known kind add up to its own? `read` counts from the record's content."""
+    if opcode == MESSAGE:
+        return length >= MESSAGE_HEAD
+    position = 0
+    for part in _SHAPES[opcode]:
+        if part in "bB":
+            size = 4 if part == "b" else 8
+            position += size + int.from_bytes(read(position, size), "little")
+        else:
+            position += int(part)
+        if position > length:
+            return False
+    return position == length
 
 
 class Cursor:
@@ -42,17 +80,16 @@ class Cursor:
         """An unsigned integer of `size` bytes."""
         return int.from_bytes(self.take(size), "little")
 
-    def text(self, size: int = 4) -> str:
-        """A string after its length of `size` bytes."""
-        content = self.take(self.number(size))
-        try:
-            return content.decode()
-        except UnicodeDecodeError:
-            raise DamagedError("a text that is not UTF-8") from None
-
     def block(self, size: int = 4) -> bytes:
         """Bytes after their length of `size` bytes."""
         return self.take(self.number(size))
+
+    def text(self) -> str:
+        """A string."""
+        try:
+            return self.block().decode()
+        except UnicodeDecodeError:
+            raise DamagedError("a text that is not UTF-8") from None
 
     def texts(self) -> dict[str, str]:
         """A map of strings."""
@@ -67,11 +104,6 @@ class Cursor:
     def is_at_end(self) -> bool:
         """Has everything been read?"""
         return self._position >= len(self._content)
-
-    def end(self) -> None:
-        """Raise DamagedError unless everything has been read."""
-        if not self.is_at_end:
-            raise DamagedError(f"{len(self._content) - self._position} bytes more than it should have")
 
 
 @dataclass(frozen=True)
@@ -95,66 +127,100 @@ class Channel:
     metadata: dict[str, str]
 
 
+class Chunk(NamedTuple):
+    """Records packed together."""
+
+    size: int
+    """Bytes of its content when inflated."""
+    crc: int
+    """Of the inflated content; 0: none."""
+    compression: str
+    content: bytes
+
+
 @dataclass(frozen=True)
 class Statistics:
     """What the writer counted."""
 
     messages: int
-    chunks: int
     by_channel: dict[int, int]
 
 
-@dataclass(frozen=True)
-class Footer:
-    """Where the summary is, and its checksum (0: none)."""
+class Footer(NamedTuple):
+    """Where the summary is (0: there is none), and its CRC (0: none)."""
 
     summary_start: int
-    summary_crc: int
+    crc: int
+
+
+class Attachment(NamedTuple):
+    """A file that was put into the recording."""
+
+    name: str
+    media_type: str
+    log_time: int
+    create_time: int
+    content: bytes
 
 
 def parse_schema(content: bytes) -> Schema:
     """Schema record. Raises DamagedError."""
     cursor = Cursor(content)
-    schema = Schema(cursor.number(2), cursor.text(), cursor.text(), cursor.text())
-    cursor.end()
-    return schema
+    return Schema(cursor.number(2), cursor.text(), cursor.text(), cursor.text())
 
 
 def parse_channel(content: bytes) -> Channel:
     """Channel record. Raises DamagedError."""
     cursor = Cursor(content)
-    channel = Channel(cursor.number(2), cursor.number(2), cursor.text(), cursor.text(), cursor.texts())
-    cursor.end()
-    return channel
+    return Channel(cursor.number(2), cursor.number(2), cursor.text(), cursor.text(), cursor.texts())
+
+
+def parse_chunk(content: bytes) -> Chunk:
+    """Chunk record. Raises DamagedError."""
+    cursor = Cursor(content)
+    cursor.take(8 + 8)
+    return Chunk(cursor.number(8), cursor.number(4), cursor.text(), cursor.block(8))
+
+
+def parse_index(content: bytes) -> NDArray[np.int64]:
+    """Places in its chunk that a MessageIndex record names. Raises DamagedError."""
+    cursor = Cursor(content)
+    cursor.take(2)
+    entries = cursor.block()
+    if len(entries) % 16:
+        raise DamagedError(f"a message index of {len(entries)} bytes, which is no whole number of entries")
+    return np.frombuffer(entries, "<i8")[1::2]
 
 
 def parse_metadata(content: bytes) -> tuple[str, dict[str, str]]:
     """Name and content of a Metadata record. Raises DamagedError."""
     cursor = Cursor(content)
-    metadata = cursor.text(), cursor.texts()
-    cursor.end()
-    return metadata
+    return cursor.text(), cursor.texts()
+
+
+def parse_attachment(content: bytes) -> tuple[Attachment, int]:
+    """Attachment record, and the CRC of all that is before it in the record (0: none). Raises DamagedError."""
+    cursor = Cursor(content)
+    log_time, create_time = cursor.number(8), cursor.number(8)
+    attachment = Attachment(cursor.text(), cursor.text(), log_time, create_time, cursor.block(8))
+    return attachment, cursor.number(4)
 
 
 def parse_statistics(content: bytes) -> Statistics:
     """Statistics record. Raises DamagedError."""
     cursor = Cursor(content)
     messages = cursor.number(8)
-    cursor.take(2 + 4 + 4 + 4)
-    chunks = cursor.number(4)
-    cursor.take(8 + 8)
+    cursor.take(2 + 4 + 4 + 4 + 4 + 8 + 8)
     counts = Cursor(cursor.block())
-    cursor.end()
     by_channel = {}
     while not counts.is_at_end:
         channel = counts.number(2)
         by_channel[channel] = counts.number(8)
-    return Statistics(messages, chunks, by_channel)
+    return Statistics(messages, by_channel)
 
 
 def parse_footer(content: bytes) -> Footer:
     """Footer record. Raises DamagedError."""
     cursor = Cursor(content)
     summary_start, _, crc = cursor.number(8), cursor.number(8), cursor.number(4)
-    cursor.end()
     return Footer(summary_start, crc)

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Batch, Bytes, Group, Ints, Layouts, values_at
 from agv_analysis.bags.errors import UndecodableError
-from agv_analysis.bags.layout import Index, Layout, Leaf, length_path
+from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
 from agv_analysis.bags.schema import STRING, Struct
-
-LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
 
 _MISFITS_BELIEVED = 100
 """So many messages, and not one of its type: then the definition is not theirs."""
@@ -99,7 +97,7 @@ class Table:
         self._store = np.empty(0, np.uint8)
         self._capacity = 0
         self._count = 0
-        self._payload_bytes = 0
+        self._message_bytes = 0
         self.layouts = Layouts(kind)
 
     @property
@@ -115,12 +113,10 @@ class Table:
         proportion to its messages.
         """
         groups = self.layouts.split(batch)
-        self._payload_bytes += int(batch.sizes.sum())
-        fits = np.zeros(len(batch), np.bool_)
+        self._message_bytes += int(batch.sizes.sum())
         for group in groups:
-            fits[group.places] = True
             self._widen(group.layout)
-        first, number = self._count, int(fits.sum())
+        first, number = self._count, sum(len(group.places) for group in groups)
         if first + number == 0 and self.layouts.misfits >= _MISFITS_BELIEVED:
             raise UndecodableError(f"its messages are not of its type: {self.layouts.first_misfit}")
         if first + number > self._capacity:
@@ -129,11 +125,12 @@ class Table:
         new = self.rows[first:]
         if self._ragged:
             new[:] = self._blank()
-        new[LOG_TIME] = batch.log_time[fits]
-        new[PUBLISH_TIME] = batch.publish_time[fits]
-        ranks = np.cumsum(fits) - 1
+        if len(groups) == 1:
+            self._write(groups[0], new, slice(None))
+            return
+        ranks = _ranks([group.places for group in groups], len(batch))
         for group in groups:
-            self._write(group, new, slice(None) if len(group.places) == number else ranks[group.places])
+            self._write(group, new, ranks[group.places])
 
     # -- storage -----------------------------------------------------------------------------------------------------
 
@@ -159,7 +156,7 @@ class Table:
     def _move(self, dtype: np.dtype[np.void], rows: int, room: int) -> None:
         """Move the rows to a new store for `rows` rows, or for `room` if that is more and not too much."""
         needed = rows * dtype.itemsize
-        if needed > max(_PADDING_FREE, _PADDING_FACTOR * self._payload_bytes):
+        if needed > max(_PADDING_FREE, _PADDING_FACTOR * self._message_bytes):
             raise UndecodableError(
                 f"its strings or sequences differ so much in length that {rows} messages would take "
                 f"{needed / 2**20:.0f} MiB as an array"
@@ -220,9 +217,9 @@ class Table:
         store, size = new.view(np.uint8), self._dtype.itemsize
         for source, target, length in runs:
             column = np.ndarray((len(new),), f"V{length}", store.data, target, (size,))
-            column[rows] = values_at(group.payloads, source, f"V{length}")
+            column[rows] = values_at(group.messages, source, f"V{length}")
         for leaf in leaves:
-            _write_leaf(new[leaf.path], rows, leaf, group.payloads)
+            _write_leaf(new[leaf.path], rows, leaf, group.messages)
         for path, counts in group.layout.counts.items():
             lengths = new[length_path(path)]
             for index, count in counts.items():
@@ -230,10 +227,18 @@ class Table:
                 lengths[place] = count
 
 
-def _write_leaf(column: NDArray[Any], rows: slice | Ints, leaf: Leaf, payloads: Bytes) -> None:
+def _ranks(places: list[Ints], total: int) -> Ints:
+    """Where each of `total` messages comes among those at `places`, which are the ones that are kept."""
+    kept = np.zeros(total, np.int64)
+    for some in places:
+        kept[some] = 1
+    return np.asarray(np.cumsum(kept) - 1)
+
+
+def _write_leaf(column: NDArray[Any], rows: slice | Ints, leaf: Leaf, messages: Bytes) -> None:
     """Write the values of a leaf to the rows `rows` of a column."""
     block = () if leaf.block is None else (slice(0, leaf.block),)
-    values = _values(payloads, leaf)
+    values = _values(messages, leaf)
     if leaf.indices == [()]:
         place: tuple[Any, ...] = (rows, *block)
         column[place] = values[:, 0]
@@ -243,13 +248,13 @@ def _write_leaf(column: NDArray[Any], rows: slice | Ints, leaf: Leaf, payloads: 
     column[place] = values
 
 
-def _values(payloads: Bytes, leaf: Leaf) -> NDArray[Any]:
+def _values(messages: Bytes, leaf: Leaf) -> NDArray[Any]:
     """All values of a leaf, shape (n, k) or, for blocks of b values, (n, k, b)."""
-    n, size = payloads.shape
+    n, size = messages.shape
     item = np.dtype(leaf.code).itemsize
     if leaf.block is None:
-        windows: NDArray[Any] = np.ndarray((n, size - item + 1), leaf.code, payloads.data, strides=(size, 1))
+        windows: NDArray[Any] = np.ndarray((n, size - item + 1), leaf.code, messages.data, strides=(size, 1))
     else:
         shape = (n, size - item * leaf.block + 1, leaf.block)
-        windows = np.ndarray(shape, leaf.code, payloads.data, strides=(size, 1, item))
+        windows = np.ndarray(shape, leaf.code, messages.data, strides=(size, 1, item))
     return windows[:, leaf.offsets]

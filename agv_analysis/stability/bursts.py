@@ -26,17 +26,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from agv_analysis.run import Floats
-from agv_analysis.stability.linearisation import burst_maps, reachable, step_matrices
+from agv_analysis.stability.linearisation import MARGINAL, burst_maps, is_constant, reachable, step_matrices
 from agv_analysis.stability.products import log_spectral_radius
 from agv_cloud.parameters import ControllerParameters
 
 STABLE = "stable"
 UNSTABLE = "unstable"
 UNDECIDED = "undecided"
-
-_MARGINAL = -1e-13
-"""Growth per step (logarithm) above which a sequence counts as not dying out: round-off is 1e-16, and marginal is not
-stable."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ def verdict(n_max: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, t
     growth = list(_repeated_growths(F, G, n_max + 1))
     worst = int(np.argmax(growth))
     lower = math.exp(growth[worst])
-    if growth[worst] > _MARGINAL:
+    if growth[worst] > MARGINAL:
         return BurstVerdict(n_max, UNSTABLE, lower, math.inf, worst, None)
     certificate = _common_norm(_sample(F, G, np.abs(v_r), n_max + 1))
     if certificate is None:
@@ -80,7 +76,7 @@ def largest_n(
     both None: stable up to `limit`. They are neighbours unless what lies between them is undecided.
     """
     refuted = next(
-        (n for n, growth in enumerate(_repeated_growths(*_lap(v_r, w_r, gains, ts), limit + 1)) if growth > _MARGINAL),
+        (n for n, growth in enumerate(_repeated_growths(*_lap(v_r, w_r, gains, ts), limit + 1)) if growth > MARGINAL),
         None,
     )
     proved, beyond = -1, limit + 1 if refuted is None else refuted
@@ -115,7 +111,7 @@ def largest_n_across(v: float, gains: ControllerParameters, ts: float) -> int | 
 
 def _lap(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> tuple[Floats, Floats]:
     """F and G of the lap's steps, of what the AGV can reach alone; a single row where speeds are constant."""
-    if np.ptp(v_r) == 0.0 and np.ptp(w_r) == 0.0:
+    if is_constant(v_r, w_r):
         v_r, w_r = v_r[:1], w_r[:1]
     size = reachable(v_r, w_r)
     F, G = step_matrices(v_r, w_r, gains, ts)

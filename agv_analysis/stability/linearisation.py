@@ -19,9 +19,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
+from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
+from agv_cloud.tracking_error import tracking_error
+
+MARGINAL = -1e-13
+"""Growth per step (logarithm) that counts as none: round-off is 1e-16, and an error that stays is not stable."""
 
 
 def step_matrices(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> tuple[Floats, Floats]:
@@ -45,6 +51,11 @@ def reachable(v_r: Floats, w_r: Floats) -> int:
     return 2 if np.any(w_r != 0.0) else 1
 
 
+def is_constant(v_r: Floats, w_r: Floats) -> bool:
+    """Are the speeds of a track the same at all steps?"""
+    return bool(np.ptp(v_r) == 0.0 and np.ptp(w_r) == 0.0)
+
+
 def burst_maps(F: Floats, G: Floats, longest: int) -> Iterator[Floats]:
     """Maps of the error from one reception to the next, L = 1 .. longest steps later, each of the shape of F.
 
@@ -58,3 +69,51 @@ def burst_maps(F: Floats, G: Floats, longest: int) -> Iterator[Floats]:
         now = (np.arange(steps) + i) % steps
         M = F[now] @ M + G[now]
         yield M
+
+
+def reception_maps(F: Floats, G: Floats, received: NDArray[np.int64], end: int) -> Floats:
+    """Maps of the error from each reception to the next, and from the last to step `end`; shape (receptions, m, m).
+
+    `received` holds the steps of the receptions, increasing; steps beyond the rows of F and G, shape (N, m, m), are
+    those of further laps.
+    """
+    lengths = np.diff(np.append(received, end))
+    maps = np.broadcast_to(np.eye(F.shape[-1]), (len(received), *F.shape[1:])).copy()
+    for i in range(int(lengths.max())):
+        going = np.flatnonzero(lengths > i)
+        now = (received[going] + i) % len(F)
+        maps[going] = F[now] @ maps[going] + G[now]
+    return np.asarray(maps)
+
+
+def loop_jacobians(
+    pose: Floats, held: Floats, reference: Floats, gains: ControllerParameters, ts: float
+) -> tuple[Floats, Floats]:
+    """Derivatives of X_c(k+1) with respect to X_c(k) and to X_c(k-n), about any motion; each of shape (N, 3, 3).
+
+    `pose` = X_c(k) and `held` = X_c(k-n) of shape (N, 3), `reference` = x, y, theta, v_r, w_r at step k, shape (N, 5),
+    frame `map`. For Euler's step (the paper's eq. 100) under `control_law` and `limit_speed`; a command at the limit
+    does not answer to the error along the track. A(k) of eq. 55 is their sum at zero error.
+    """
+    theta, v_r = pose[:, 2], reference[:, 3]
+    x_e, y_e, theta_e, v = np.array([_answer(r, h, gains) for r, h in zip(reference, held, strict=True)]).T
+    free = (np.abs(v) < gains.v_max).astype(np.float64)
+    zero = np.zeros(len(pose))
+    now = np.broadcast_to(np.eye(3), (len(pose), 3, 3)).copy()
+    now[:, 0, 2], now[:, 1, 2] = -ts * v * np.sin(theta), ts * v * np.cos(theta)
+    command_of_error = np.array([
+        [free * gains.kx, zero, -free * v_r * np.sin(theta_e)],
+        [zero, v_r * gains.ky, v_r * gains.ktheta * np.cos(theta_e)],
+    ])  # fmt: skip
+    cos, sin = np.cos(held[:, 2]), np.sin(held[:, 2])
+    error_of_pose = np.array([[-cos, -sin, y_e], [sin, -cos, -x_e], [zero, zero, zero - 1.0]])
+    pose_of_command = ts * np.array([[np.cos(theta), zero], [np.sin(theta), zero], [zero, zero + 1.0]])
+    return now, np.asarray(np.einsum("ijk,jlk,lmk->kim", pose_of_command, command_of_error, error_of_pose))
+
+
+def _answer(reference: Floats, held: Floats, gains: ControllerParameters) -> tuple[float, float, float, float]:
+    """The error that the edge sees at one step, and the speed that it commands."""
+    x_r, y_r, theta_r, v_r, w_r = reference.tolist()
+    x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, *held.tolist())
+    v, _ = control_law(x_e, y_e, theta_e, v_r, w_r, gains.kx, gains.ky, gains.ktheta)
+    return x_e, y_e, theta_e, limit_speed(v, gains.v_max)

@@ -67,6 +67,62 @@ def spectral_radii(
     return _largest_distance_from_one(a * cos_delta + b, second, third)
 
 
+def largest_n(theta: Floats, v_r: Floats, gains: ControllerParameters, ts: float) -> int | None:
+    """Largest n_ul for which the test holds at every step of a lap driven on the reference, and for all smaller ones.
+
+    Heading theta [rad] and speed v_r [m/s] of the reference, shape (N,); for k < n the edge holds X_c(0). -1 if it
+    fails even without outages, None if it holds for every n up to the lap's end.
+
+    For a pose held at step j the test fails from the step k on at which |theta(k) - theta(j)| first reaches a critical
+    angle. That some pair at most n steps apart fails is monotone in n, and seen from sliding extremes of the heading.
+    """
+    if not np.all(spectral_radii(theta, theta, v_r, gains, ts) < 1.0):
+        return -1
+    critical = _critical_angles(v_r, gains, ts)
+
+    def fails(n: int) -> bool:
+        highest, lowest = _extremes_ahead(theta, n)
+        return bool(np.any((highest - theta >= critical) | (theta - lowest >= critical)))
+
+    holds, broken = 0, len(theta) - 1
+    if not fails(broken):
+        return None
+    while broken - holds > 1:
+        middle = (holds + broken) // 2
+        holds, broken = (holds, middle) if fails(middle) else (middle, broken)
+    return holds
+
+
+def _critical_angles(v: Floats, gains: ControllerParameters, ts: float) -> Floats:
+    """Smallest |Delta| at which A(k) has an eigenvalue of modulus 1, for v = v_r(k-n); inf if there is none.
+
+    With q = cos Delta the coefficients of the cubic are linear in q. An eigenvalue is -1 where it vanishes at mu = 2; a
+    pair is on the unit circle where the pair's sum in mu equals its product, which leaves a quadratic equation in q.
+    """
+    a, b, c = ts * gains.kx, ts * gains.ktheta * v, ts * ts * gains.ky * v * v
+    s, d = a * b + c, a * c
+    p2, p1, p0 = s * (s - a), a * d - 2.0 * s * d - b * s, d * (d + b + 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.sqrt(p1 * p1 - 4.0 * p2 * p0)
+        pairs = 2.0 * p0 / np.array([-p1 - root, -p1 + root])
+        total = s * pairs - d
+        pairs[~((total > 0.0) & (total < 4.0))] = np.nan  # the roots of such a pair are real
+        cosines = np.vstack((pairs, (8.0 - 4.0 * b - d) / (4.0 * a - 2.0 * s)))
+    nearest = np.where(np.abs(cosines) <= 1.0, cosines, -2.0).max(axis=0)
+    return np.where(nearest >= -1.0, np.arccos(np.maximum(nearest, -1.0)), np.inf)
+
+
+def _extremes_ahead(theta: Floats, n: int) -> tuple[Floats, Floats]:
+    """Largest and smallest of theta(k) .. theta(k + n), shape (N,); fewer at the end."""
+    highest, lowest, width = theta.copy(), theta.copy(), 1
+    while width <= n:
+        shift = min(width, n + 1 - width)
+        highest[:-shift] = np.maximum(highest[:-shift], highest[shift:])
+        lowest[:-shift] = np.minimum(lowest[:-shift], lowest[shift:])
+        width += shift
+    return highest, lowest
+
+
 def _largest_distance_from_one(t: Floats, s: Floats, d: Floats) -> Floats:
     """max |1 - mu| over the roots of mu^3 - t mu^2 + s mu - d."""
     real = _real_root(t, s, d)

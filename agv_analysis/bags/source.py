@@ -1,0 +1,131 @@
+"""The bytes of an MCAP file, and where in them the next record is when the last one does not say so."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from agv_analysis.bags.compression import MAX_CHUNK
+from agv_analysis.bags.errors import BagError, DamagedError
+from agv_analysis.bags.records import MAGIC, MESSAGE, RECORD, has_shape, is_known
+
+_AHEAD = 2**18
+"""Bytes that are read at least: a chunk with its message indexes, as a rule."""
+
+_WINDOW = 2**22
+_MAX_CANDIDATES = 200_000
+"""So many places of a file are looked at in search of records; more only a file made for the purpose has."""
+
+_RECORD_START = re.compile(rb"(?=[\x01-\x0f].{5}\x00{3})", re.DOTALL)
+"""A known opcode, and a length below 2^40."""
+
+
+class Record(NamedTuple):
+    """A record as it lies in the file."""
+
+    position: int
+    opcode: int
+    content: bytes
+
+    @property
+    def end(self) -> int:
+        """Where the next record should begin."""
+        return self.position + RECORD.size + len(self.content)
+
+
+class Source:
+    """An MCAP file that is open for reading.
+
+    It is read, not mapped: a bad sector, or a file that shrinks, is an error then and not the end of the process.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises BagError if it cannot be read."""
+        self.path = path
+        self._candidates = 0
+        self._ahead = b""
+        self._ahead_at = 0
+        try:
+            self._file = path.open("rb", buffering=0)
+            self.size = path.stat().st_size
+        except OSError as error:
+            raise BagError(f"{path}: cannot be read: {error.strerror}") from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def read(self, position: int, count: int) -> bytes:
+        """Up to `count` bytes from `position` on, fewer at the end of the file. Raises BagError."""
+        begin = position - self._ahead_at
+        if begin < 0 or begin + count > len(self._ahead):
+            self._ahead, self._ahead_at, begin = self._fetch(position, max(count, _AHEAD)), position, 0
+        return self._ahead[begin : begin + count]
+
+    def _fetch(self, position: int, count: int) -> bytes:
+        left, parts = max(0, min(count, self.size - position)), []
+        try:
+            self._file.seek(position)
+            while left and (part := self._file.read(left)):
+                parts.append(part)
+                left -= len(part)
+        except OSError as error:
+            raise BagError(f"{self.path}: cannot be read at byte {position}: {error.strerror}") from None
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def head(self, position: int) -> tuple[int, int]:
+        """Opcode and length of the record at `position`. Raises DamagedError if the file does not hold all of it."""
+        head = self.read(position, RECORD.size)
+        if len(head) < RECORD.size:
+            raise DamagedError(f"{len(head)} bytes, too few for a record")
+        opcode, length = RECORD.unpack(head)
+        left = self.size - position - RECORD.size
+        if length > left:
+            raise DamagedError(f"a record of {length} bytes where {left} are left")
+        return opcode, length
+
+    def record(self, position: int) -> Record:
+        """The record at `position`. Raises DamagedError if there is none whose inner lengths fit."""
+        opcode, length = self.head(position)
+        if opcode == 0:
+            raise DamagedError("a record of kind 0, which there is not")
+        if length > MAX_CHUNK + _WINDOW:
+            raise DamagedError(f"a record of {length} bytes, too long to be read")
+        content = self.read(position + RECORD.size, length)
+        if is_known(opcode) and not has_shape(opcode, length, lambda at, count: content[at : at + count]):
+            raise DamagedError("a record whose lengths contradict each other")
+        return Record(position, opcode, content)
+
+    def is_record(self, position: int, depth: int = 3) -> bool:
+        """Is there a record of a known kind at `position`? A message must be followed by others, or by the end."""
+        try:
+            opcode, length = self.head(position)
+        except DamagedError:
+            return False
+        begin = position + RECORD.size
+        if not is_known(opcode) or not has_shape(opcode, length, lambda at, count: self.read(begin + at, count)):
+            return False
+        if opcode != MESSAGE or depth == 0:
+            return True
+        return self.is_end(begin + length) or self.is_record(begin + length, depth - 1)
+
+    def is_end(self, position: int) -> bool:
+        """Is this the end of the file's records?"""
+        return position == self.size or (position == self.size - len(MAGIC) and self.read(position, 8) == MAGIC)
+
+    def next_record(self, position: int) -> int | None:
+        """Where the next record after `position` begins, None if there is none to be found."""
+        position += 1
+        while position < self.size:
+            window = self.read(position, _WINDOW)
+            for found in _RECORD_START.finditer(window):
+                self._candidates += 1
+                if self._candidates > _MAX_CANDIDATES:
+                    return None
+                if self.is_record(position + found.start()):
+                    return position + found.start()
+            if len(window) < _WINDOW:
+                break
+            position += _WINDOW - RECORD.size + 1
+        return None

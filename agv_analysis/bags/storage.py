@@ -1,0 +1,54 @@
+"""What a bag consists of: files with messages in them, whatever their format."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Protocol
+
+from agv_analysis.bags.batch import Batch
+from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.records import Attachment, Channel, Schema
+
+IsWanted = Callable[[Channel], bool]
+
+
+class Storage(Protocol):
+    """One file of a bag; everything but the batches is complete only after these have been read."""
+
+    path: Path
+    findings: Findings
+    metadata: dict[str, dict[str, str]]
+    attachments: list[Attachment]
+    counts: Counter[int]
+    """Messages found by channel."""
+    position: int
+    """How much has been read, of `size`."""
+
+    @property
+    def size(self) -> int:
+        """How much there is to read [B]."""
+        ...
+
+    @property
+    def schemas(self) -> dict[int, Schema]:
+        """Schemas by number."""
+        ...
+
+    @property
+    def channels(self) -> dict[int, Channel]:
+        """Channels by number."""
+        ...
+
+    def expected(self, channel: int) -> int:
+        """Messages that the channel is said to have, 0 if nothing is said."""
+        ...
+
+    def batches(self, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
+        """The messages of all channels that are wanted, in file order, in batches of one channel. To be called once."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...

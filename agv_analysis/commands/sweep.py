@@ -1,0 +1,122 @@
+"""`agv-ncs sweep`: the loop over a grid of parameters, under many seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from agv_analysis.commands import with_settings
+from agv_analysis.sweep import METRICS
+
+if TYPE_CHECKING:
+    from agv_analysis.sweep.execute import Results
+    from agv_analysis.sweep.plan import Part, Sweep
+
+_LONGEST_TABLE = 40
+"""Points that fit on a screen."""
+
+
+@click.command("sweep")
+@with_settings
+@click.option(
+    "--vary", "axes", multiple=True, required=True, metavar="NODE.PARAMETER=VALUES",
+    help="What to vary: first:last:count, evenly spaced, or a,b,c. May be repeated: all combinations are run.",
+)  # fmt: skip
+@click.option("--seeds", type=int, default=1, show_default=True, help="How many, counted from relay.seed on.")
+@click.option(
+    "--metric", "metrics", multiple=True, type=click.Choice(["instability", *METRICS]), default=["instability"],
+    show_default=True, help="What to draw; of the others the median over the seeds. May be repeated.",
+)  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path), help="Keep results and pictures in this directory.")
+@click.option("--format", "suffix", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True)
+@click.option("--resume", is_flag=True, help="Go on with the sweep in --out, which was stopped.")
+@click.option("--workers", type=click.IntRange(1), help="Threads on this machine; one a core by default.")
+@click.option("--scheduler", metavar="ADDRESS", help="Run on the Dask cluster whose scheduler is there.")
+def command(
+    params: str,
+    settings: tuple[str, ...],
+    axes: tuple[str, ...],
+    seeds: int,
+    metrics: tuple[str, ...],
+    out: Path | None,
+    suffix: str,
+    resume: bool,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Simulate the params file PARAMS at every point of a grid, under many seeds: how likely is the loop unstable?
+
+    A run is unstable if a twin that begins a micrometre away and meets the same losses does not come closer by its end.
+    Every point meets the same seeds, so points with the same channel meet the same outages.
+
+    \b
+    Examples:
+      agv-ncs sweep config/outages.yaml --vary controller.kx=5,25,250 --seeds 20
+      agv-ncs sweep config/paper.yaml --set relay.uplink.model=bernoulli --vary controller.kx=5:400:40
+        --vary relay.uplink.p=0:0.95:20 --seeds 200 --out sweeps/gain
+      (the same with --resume goes on where Ctrl-C stopped it)
+    """
+    from agv_analysis.progress import step_bar
+    from agv_analysis.scenario import load_scenario
+    from agv_analysis.sweep.collect import collect
+    from agv_analysis.sweep.plan import Sweep, SweepError, parse_axis
+    from agv_analysis.sweep.store import Store
+
+    if resume and out is None:
+        raise SweepError("--resume goes on with a sweep in a directory: name it by --out")
+    sweep = Sweep(load_scenario(params, settings), tuple(map(parse_axis, axes)), seeds)
+    sweep.check()
+    store = None if out is None else Store(out, sweep, resume)
+
+    def results(parts: list[Part]) -> Results:
+        from agv_analysis.sweep.execute import on_dask, on_this_machine
+
+        return on_dask(sweep, parts, scheduler) if scheduler else on_this_machine(sweep, parts, workers)
+
+    with step_bar(sweep.size * seeds, "simulating") as progress:
+        rows, complete = collect(sweep, store, results, progress)
+    _report(sweep, rows, metrics, out, suffix)
+    if not complete:
+        again = ": the same command with --resume goes on" if out is not None else ""
+        click.echo(
+            f"interrupted after {sum(row['runs'] for row in rows)} of {sweep.size * seeds} runs{again}", err=True
+        )
+        raise click.exceptions.Exit(130)
+
+
+def _report(sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], out: Path | None, suffix: str) -> None:
+    from agv_analysis.sweep.picture import can_draw, draw
+    from agv_analysis.sweep.summary import write_rows
+
+    if len(rows) <= _LONGEST_TABLE:
+        _print_rows(sweep, rows)
+    if out is None or not rows:
+        return
+    write_rows(rows, out / f"points.{suffix}")
+    click.echo(f"points:  {out / f'points.{suffix}'}")
+    for metric in metrics if can_draw(sweep) else ():
+        column = metric if metric == "instability" else f"{metric}_p50"
+        draw(sweep, rows, column, out / f"{metric}.png")
+        click.echo(f"picture: {out / f'{metric}.png'}")
+
+
+def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for axis in sweep.axes:
+        table.add_column(axis.name, justify="right")
+    for name in ("runs", "unstable", "probability", "95 % confidence", "to 1 cm [steps]", "peak [m]"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        values = [row[axis.name] for axis in sweep.axes]
+        table.add_row(
+            *(f"{value:.6g}" if isinstance(value, float) else str(value) for value in values),
+            str(row["runs"]), str(row["unstable"]), f"{row['instability']:.3f}",
+            f"{row['instability_low']:.3f} .. {row['instability_high']:.3f}", f"{row['settle_1cm_steps_p50']:g}",
+            f"{row['position_peak_p50']:.4g}",
+        )  # fmt: skip
+    Console(highlight=False).print(table)

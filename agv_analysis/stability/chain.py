@@ -1,0 +1,116 @@
+"""A lossy channel as a finite Markov chain, and what follows from it in closed form.
+
+In state i the message of a slot is delivered with probability g_i; afterwards the state changes by the row T_i. With
+D = diag(1 - g) and the stationary distribution pi:
+
+    loss rate                pi D 1
+    mean age of information  E[n_ul] = pi D (I - T D)^-1 1   (the sum over j of P(the last j lost))
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_plant.parameters import ChannelParameters
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A finite Markov chain of a channel's states."""
+
+    transition: Floats
+    """T, probability of state j after state i, shape (m, m); rows sum to 1."""
+    delivery: Floats
+    """g, probability of delivery in each state, shape (m,)."""
+
+    @property
+    def stationary(self) -> Floats:
+        """pi, share of slots in each state, shape (m,)."""
+        size = len(self.delivery)
+        equations = np.vstack((self.transition.T - np.eye(size), np.ones(size)))
+        return np.asarray(np.linalg.lstsq(equations, np.append(np.zeros(size), 1.0), rcond=None)[0])
+
+    @property
+    def loss_rate(self) -> float:
+        """Share of slots that are lost."""
+        return float(self.stationary @ (1.0 - self.delivery))
+
+    @property
+    def mean_burst(self) -> float:
+        """Mean number of consecutive losses, 0 where nothing is lost."""
+        lost = 1.0 - self.delivery
+        begins = float((self.stationary * self.delivery) @ self.transition @ lost)
+        return self.loss_rate / begins if begins > 0.0 else 0.0
+
+    @property
+    def mean_age(self) -> float:
+        """E[n_ul]: mean number of steps since the freshest pose that the edge holds; inf if none ever arrives."""
+        D = np.diag(1.0 - self.delivery)
+        system = np.eye(len(D)) - self.transition @ D
+        if np.linalg.cond(system) > 1e14:
+            return float("inf")
+        return float(self.stationary @ D @ np.linalg.solve(system, np.ones(len(D))))
+
+    def burst_lengths(self, tail: float = 1e-17, longest: int = 1_000_000) -> Floats:
+        """P(L = l), l = 1, 2, ...: probability that a reception is followed by the next one l steps later.
+
+        Cut off where less than `tail` is left, at `longest` at the latest.
+        """
+        if len(self.delivery) == 1:
+            return _geometric(float(self.delivery[0]), tail, longest)
+        state = self.stationary * self.delivery
+        found: list[float] = []
+        state, left = state / state.sum(), 1.0
+        while left > tail and len(found) < longest:
+            state = state @ self.transition
+            found.append(float(state @ self.delivery))
+            state, left = state * (1.0 - self.delivery), left - found[-1]
+        return np.array(found)
+
+
+def _geometric(delivery: float, tail: float, longest: int) -> Floats:
+    if delivery >= 1.0:
+        return np.ones(1)
+    last = longest if delivery <= 0.0 else math.ceil(math.log(tail) / math.log1p(-delivery))
+    return np.asarray(delivery * (1.0 - delivery) ** np.arange(min(longest, max(1, last))))
+
+
+def bernoulli(p: float) -> Chain:
+    """Independent losses with probability `p`."""
+    return Chain(np.ones((1, 1)), np.array([1.0 - p]))
+
+
+def gilbert_elliott(p: float, r: float, h: float = 0.0, k: float = 1.0) -> Chain:
+    """The channel of `agv_plant.channels.gilbert_elliott`: states good and bad, with netem's parameters."""
+    return Chain(np.array([[1.0 - p, p], [r, 1.0 - r]]), np.array([k, h]))
+
+
+def bursty(loss_rate: float, mean_burst: float) -> Chain:
+    """The Gilbert channel (h = 0, k = 1) with a loss rate below 1, a mean burst of at least `shortest_mean_burst`."""
+    r = 1.0 / mean_burst
+    return gilbert_elliott(min(1.0, r * loss_rate / (1.0 - loss_rate)), r)
+
+
+def shortest_mean_burst(loss_rate: float) -> float:
+    """Smallest mean burst that a channel of this loss rate can have: receptions, too, last one slot at least."""
+    return max(1.0, loss_rate / (1.0 - loss_rate))
+
+
+def chain_of(channel: ChannelParameters) -> Chain | None:
+    """The chain of a channel's parameters; None for a model that is no finite Markov chain.
+
+    A single outage (burst with a start_step) is over some day: to the long run the channel is perfect.
+    """
+    if channel.model == "perfect" or (channel.model == "burst" and channel.start_step >= 0):
+        return bernoulli(0.0)
+    if channel.model == "bernoulli":
+        return bernoulli(channel.p)
+    if channel.model == "gilbert_elliott":
+        return gilbert_elliott(channel.p, channel.r, channel.h, channel.k)
+    if channel.model == "burst":
+        return Chain(np.roll(np.eye(channel.n + 1), 1, axis=1), np.eye(channel.n + 1)[0])
+    return None

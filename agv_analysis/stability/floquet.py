@@ -1,0 +1,144 @@
+"""Floquet multipliers: what one lap, driven again and again, does to a small error.
+
+The lap is a linear periodic system, so this is the exact answer for its very speeds and its very drops, where the
+criteria at frozen speeds are only indications. Growths are given as natural logarithms, because a lap of 20 000 steps
+shrinks errors by hundreds of powers of ten. The loop is stable if the largest one is below 0.
+
+- `constant_delay`: the pose is n steps old at every step (the lifted system of dimension 3 (n+1), never formed);
+- `drop_sequence`: the sequence of losses is given, one verdict a step; between receptions the sample is held;
+- `trajectory`: the same about the motion that was really driven, which may be far from the reference.
+
+Where the AGV does not move on the whole lap, only the errors that it can reach count (see `linearisation.reachable`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.run import Floats
+from agv_analysis.simulation.compiled import compiled
+from agv_analysis.stability.lifted import critical_delay_across, critical_delay_along, spectral_radius
+from agv_analysis.stability.linearisation import (
+    MARGINAL,
+    is_constant,
+    loop_jacobians,
+    reachable,
+    reception_maps,
+    step_matrices,
+)
+from agv_analysis.stability.products import growths
+from agv_cloud.parameters import ControllerParameters
+
+_COLUMNS = 4
+"""Directions followed at once, more than a complex pair of multipliers needs."""
+
+_LAPS = 40
+
+
+def constant_delay(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
+    """Largest growth (logarithm) over a lap of the error, if the pose is always `n` steps old.
+
+    Speeds v_r [m/s], w_r [rad/s] of shape (N,). By iterating a subspace of the lifted system over laps until its
+    largest Ritz value settles.
+    """
+    if is_constant(v_r, w_r):
+        return len(v_r) * math.log(spectral_radius(n, float(v_r[0]), float(w_r[0]), gains, ts))
+    size = reachable(v_r, w_r)
+    F, G = (np.ascontiguousarray(M[:, :size, :size]) for M in step_matrices(v_r, w_r, gains, ts))
+    columns = min(_COLUMNS, size * (n + 1))
+    window = np.random.default_rng(0).standard_normal((n + 1, size, columns))
+    growth = math.nan
+    for _ in range(_LAPS):
+        basis, _ = np.linalg.qr(window.reshape(-1, columns))
+        window = basis.reshape(window.shape).copy()
+        log_scale = compiled(_drive_lap)(F, G, window)
+        ritz = np.abs(np.linalg.eigvals(basis.T @ window.reshape(-1, columns))).max()
+        before, growth = growth, log_scale + math.log(ritz) if ritz > 0.0 else -math.inf
+        if growth == before or abs(growth - before) <= 1e-10 * max(1.0, abs(growth)):
+            break
+    return growth
+
+
+def largest_constant_delay(
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 10_000
+) -> int | None:
+    """Largest constant n for which the lap contracts the error; -1 if not even 0 does, None if all up to `limit` do.
+
+    Arguments as of `constant_delay`. The closed forms for a straight track at the mean speed say where to look.
+    """
+
+    def contracts(n: int) -> bool:
+        return constant_delay(n, v_r, w_r, gains, ts) < MARGINAL * len(v_r)
+
+    mean = float(np.abs(v_r).mean())
+    guess = min(critical_delay_along(ts * gains.kx), critical_delay_across(mean, gains, ts), limit)
+    stable, step = math.ceil(guess) - 1, 1
+    while stable >= 0 and not contracts(stable):
+        stable, step = max(-1, stable - step), 2 * step
+    unstable, step = stable + 1, 1
+    while unstable <= limit and contracts(unstable):
+        stable, unstable, step = unstable, unstable + step, 2 * step
+    if unstable > limit:
+        return None
+    while unstable - stable > 1:
+        middle = (stable + unstable) // 2
+        stable, unstable = (middle, unstable) if contracts(middle) else (stable, middle)
+    return stable
+
+
+def _drive_lap(F: Floats, G: Floats, window: Floats) -> float:
+    """Send the last n + 1 errors, shape (n + 1, m, columns), oldest first, through a lap; in place.
+
+    What is left in `window` is to be multiplied by exp(return value).
+    """
+    length, size, columns = window.shape
+    log_scale, oldest = 0.0, 0
+    fresh = np.empty((size, columns))
+    for k in range(F.shape[0]):
+        newest = oldest - 1 if oldest > 0 else length - 1
+        largest = 0.0
+        for i in range(size):
+            for j in range(columns):
+                value = 0.0
+                for m in range(size):
+                    value += F[k, i, m] * window[newest, m, j] + G[k, i, m] * window[oldest, m, j]
+                fresh[i, j] = value
+                largest = max(largest, abs(value))
+        window[oldest] = fresh
+        oldest = oldest + 1 if oldest + 1 < length else 0
+        if largest > 1e100 or 0.0 < largest < 1e-100:
+            window /= largest
+            log_scale += math.log(largest)
+    window[:] = np.concatenate((window[oldest:], window[:oldest]))
+    return log_scale
+
+
+def drop_sequence(lost: NDArray[np.bool_], v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> Floats:
+    """Growths (logarithms) over the recorded steps of the three directions of the error, largest first, shape (m,).
+
+    `lost` of shape (N,) says which updates were lost at the steps whose speeds are v_r [m/s], w_r [rad/s]; the sequence
+    is taken as if driven again and again. 0 for each direction if no update was ever received: an open loop.
+    """
+    size = reachable(v_r, w_r)
+    received = np.flatnonzero(~lost)
+    if not len(received):
+        return np.zeros(size)
+    F, G = (M[:, :size, :size] for M in step_matrices(v_r, w_r, gains, ts))
+    return growths(reception_maps(F, G, received, received[0] + len(lost)))
+
+
+def trajectory(
+    pose: Floats, reference: Floats, lost: NDArray[np.bool_], gains: ControllerParameters, ts: float
+) -> Floats:
+    """As `drop_sequence`, linearised about the motion that was driven instead of about the reference.
+
+    X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`. The growths are those of a displacement
+    of the whole run, in [m, m, rad] of the map.
+    """
+    age = np.arange(len(lost)) - np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
+    held = pose[np.arange(len(lost)) - age]
+    now, outdated = loop_jacobians(pose, held, reference, gains, ts)
+    return growths(reception_maps(now, outdated, np.flatnonzero(age == 0), len(lost)))

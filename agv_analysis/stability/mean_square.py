@@ -1,0 +1,210 @@
+"""Mean square: does E[|e|^2] die out under random losses?
+
+With the held sample h the loop is a Markov jump linear system: xi = (e, h) goes to ((F+G) e, e) at a reception and to
+(F e + G h, h) at a loss. With X_i = E[xi xi'; channel in state i] the second moments obey the linear recursion
+
+    X_j(k+1) = sum_i T_ij [ g_i A_1(k) X_i(k) A_1(k)' + (1 - g_i) A_0(k) X_i(k) A_0(k)' ]
+
+and the loop is mean-square stable if and only if its spectral radius (over a lap: its largest Floquet multiplier) is
+below 1. Source: Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005, theorem 3.9.
+
+Along the track, with a = T_s K_x: for independent bursts E[L^2] / E[L] < 2 / a, that is E[n_ul] < 1/a - 1/2: the mean
+age of information plus half a step stays below 1/K_x. Independent losses: p < (2 - a) / (2 + a). Bursts of mean
+length B at a loss rate pi: pi B < 1/a - 1/2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_analysis.simulation.compiled import compiled
+from agv_analysis.stability.chain import Chain, bernoulli, bursty, shortest_mean_burst
+from agv_analysis.stability.linearisation import MARGINAL, is_constant, reachable, step_matrices
+from agv_cloud.parameters import ControllerParameters
+
+_LAPS = 40
+
+
+def operator(F: Floats, G: Floats, chain: Chain) -> Floats:
+    """Matrix of the recursion at one step's F and G, shape (m, m) each: shape (s, s), s = states * (2 m)^2."""
+    size, zero, one = len(F), np.zeros_like(F), np.eye(len(F))
+    received = np.block([[F + G, zero], [one, zero]])
+    missed = np.block([[F, G], [zero, one]])
+    rows = [
+        np.kron(T_i[:, None], g * np.kron(received, received) + (1.0 - g) * np.kron(missed, missed))
+        for T_i, g in zip(chain.transition, chain.delivery, strict=True)
+    ]
+    return np.hstack(rows).reshape(len(rows) * 4 * size * size, -1)
+
+
+def spectral_radius(F: Floats, G: Floats, chain: Chain) -> float:
+    """Growth of the second moments per step at speeds that do not change; arguments as of `operator`."""
+    return float(np.abs(np.linalg.eigvals(operator(F, G, chain))).max())
+
+
+def along_spectral_radius(a: float, chain: Chain) -> float:
+    """As `spectral_radius`, of the error along a straight track alone; a = T_s K_x."""
+    return spectral_radius(np.ones((1, 1)), np.full((1, 1), -a), chain)
+
+
+def lap_growth(
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, chain: Chain, moments: Floats | None = None
+) -> float:
+    """Growth (logarithm) of the second moments over a lap with the speeds v_r [m/s], w_r [rad/s] of shape (N,).
+
+    By driving laps until the growth settles; `moments`, shape (3, states, m, m), are those to begin with, and are left
+    as they settled, which makes the next call with a similar chain faster.
+    """
+    size = reachable(v_r, w_r)
+    F, G = (np.ascontiguousarray(M[:, :size, :size]) for M in step_matrices(v_r, w_r, gains, ts))
+    if is_constant(v_r, w_r) and len(chain.delivery) <= 8:
+        return len(v_r) * math.log(spectral_radius(F[0], G[0], chain))
+    if moments is None:
+        moments = unit_moments(len(chain.delivery))
+    moments = moments[:, :, :size, :size]
+    growth = math.nan
+    for _ in range(_LAPS):
+        log_scale = compiled(_drive_lap)(F, G, chain.transition, chain.delivery, moments)
+        # From one lap to the next the moments keep their proportions in the end, so their size says it all.
+        size_now = float(np.trace(moments[0] + moments[2], axis1=1, axis2=2).sum())
+        moments /= size_now
+        before, growth = growth, log_scale + math.log(size_now)
+        if abs(growth - before) <= 1e-8 * max(1.0, abs(growth)):
+            break
+    return growth
+
+
+def unit_moments(states: int) -> Floats:
+    """Moments for `lap_growth` to begin with."""
+    return np.array(np.broadcast_to(np.eye(3), (3, states, 3, 3)))
+
+
+def _drive_lap(F: Floats, G: Floats, T: Floats, g: Floats, moments: Floats) -> float:
+    """Send the moments E[e e'], E[e h'], E[h h'] by channel state, shape (3, states, m, m), through a lap; in place.
+
+    What is left in them is to be multiplied by exp(return value).
+    """
+    states, size = moments.shape[1], moments.shape[2]
+    log_scale = 0.0
+    # Of each state: what goes on if its slot is received, and if it is lost; each as (ee, eh, hh).
+    received, missed = np.zeros_like(moments), np.zeros_like(moments)
+    upper, M = np.zeros((size, size)), np.zeros((size, size))
+    for k in range(F.shape[0]):
+        M[:] = F[k] + G[k]
+        for i in range(states):
+            ee, eh, hh = moments[0, i], moments[1, i], moments[2, i]
+            _multiply(M, ee, False, received[1, i], False)
+            _multiply(received[1, i], M, True, received[0, i], False)
+            received[2, i] = ee
+            _multiply(F[k], eh, False, missed[1, i], False)
+            _multiply(G[k], hh, False, missed[1, i], True)
+            _multiply(F[k], ee, False, upper, False)
+            _multiply(G[k], eh, True, upper, True)
+            _multiply(upper, F[k], True, missed[0, i], False)
+            _multiply(missed[1, i], G[k], True, missed[0, i], True)
+            missed[2, i] = hh
+        largest = 0.0
+        for j in range(states):
+            _mix(T[:, j], g, received, missed, moments[:, j])
+            for p in range(size):
+                largest = max(largest, moments[0, j, p, p], moments[2, j, p, p])
+                for q in range(p):
+                    # Rounding makes a skew part, which would not obey the recursion of the moments and outlive them.
+                    mean = 0.5 * (moments[0, j, p, q] + moments[0, j, q, p])
+                    moments[0, j, p, q], moments[0, j, q, p] = mean, mean
+        if largest > 1e100 or 0.0 < largest < 1e-100:
+            moments /= largest
+            log_scale += math.log(largest)
+    return log_scale
+
+
+def _mix(weights: Floats, g: Floats, received: Floats, missed: Floats, mixed: Floats) -> None:
+    """What comes into one state: from each state i with weight T_ij, received with probability g_i or lost."""
+    for which in range(3):
+        for p in range(mixed.shape[1]):
+            for q in range(mixed.shape[1]):
+                value = 0.0
+                for i in range(len(g)):
+                    came = g[i] * received[which, i, p, q] + (1.0 - g[i]) * missed[which, i, p, q]
+                    value += weights[i] * came
+                mixed[which, p, q] = value
+
+
+def _multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool) -> None:
+    """`product` = A B, or A B' if `transposed`; added to what is there if `add`. All of shape (m, m)."""
+    size = A.shape[0]
+    for i in range(size):
+        for j in range(size):
+            value = product[i, j] if add else 0.0
+            for m in range(size):
+                value += A[i, m] * (B[j, m] if transposed else B[m, j])
+            product[i, j] = value
+
+
+def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
+    """Loss probability p* below which independent losses leave a lap mean-square stable; -1: unstable without any."""
+    moments = unit_moments(1)
+
+    def growth(p: float) -> float:
+        return lap_growth(v_r, w_r, gains, ts, bernoulli(p), moments) - MARGINAL * len(v_r)
+
+    return crossing(growth, 0.0, 1.0) if growth(0.0) < 0.0 else -1.0
+
+
+def critical_burst(loss_rate: float, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
+    """Mean burst B* [steps] below which a Gilbert channel of this loss rate in (0, 1) leaves a lap mean-square stable.
+
+    -1 if the shortest bursts possible are too long, inf if 1e6 steps are not.
+    """
+    moments = unit_moments(2)
+
+    def growth(burst: float) -> float:
+        return lap_growth(v_r, w_r, gains, ts, bursty(loss_rate, burst), moments) - MARGINAL * len(v_r)
+
+    low, high = 0.0, shortest_mean_burst(loss_rate)
+    while growth(high) < 0.0:
+        low, high = high, 2.0 * high
+        if low > 1e6:
+            return math.inf
+    return crossing(growth, low, high) if low else -1.0
+
+
+def crossing(f: Callable[[float], float], low: float, high: float) -> float:
+    """Where a continuous function changes its sign between `low` and `high`, to 1e-9 (Chandrupatla, 1997).
+
+    Inverse quadratic interpolation where three points allow it, bisection elsewhere (Adv. Eng. Software 28, 145).
+    """
+    b, c, share = low, high, 0.5
+    fb, fc = f(b), f(c)
+    a, fa = c, fc
+    for _ in range(100):
+        x = b + share * (c - b)
+        fx = f(x)
+        if (fx > 0.0) == (fb > 0.0):
+            a, fa = b, fb
+        else:
+            a, fa, c, fc = c, fc, b, fb
+        b, fb = x, fx
+        if fb == 0.0 or abs(c - b) <= 1e-9 * max(1.0, abs(b)):
+            break
+        share = 0.5
+        if math.isfinite(fa) and math.isfinite(fc) and fa != fc and fa != fb:
+            along, across = (b - c) / (a - c), (fb - fc) / (fa - fc)
+            if across**2 < along and (1.0 - across) ** 2 < 1.0 - along:
+                share = fb / (fc - fb) * fa / (fc - fa) + (a - b) / (c - b) * fb / (fa - fb) * fc / (fa - fc)
+                share = min(0.999, max(1e-3, share))
+    return b if abs(fb) < abs(fc) else c
+
+
+def critical_loss_along(a: float) -> float:
+    """p* = (2 - a) / (2 + a) of the error along a straight track, a = T_s K_x; -1 where no loop is stable."""
+    return (2.0 - a) / (2.0 + a) if 0.0 < a < 2.0 else -1.0
+
+
+def critical_mean_age_along(a: float) -> float:
+    """E[n_ul] = 1/a - 1/2 [steps], below which the error along a straight track is mean-square stable."""
+    return 1.0 / a - 0.5 if 0.0 < a < 2.0 else -1.0

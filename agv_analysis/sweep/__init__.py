@@ -1,0 +1,16 @@
+"""Sweeps: the loop at every point of a grid of parameters, under many seeds.
+
+    plan      what is to be run: axes, points, seeds, and the parts that it is done in
+    execute   parts on all cores of this machine, or on a Dask cluster
+    store     parts kept on disk as they are done, so that a sweep that was stopped can go on
+    summary   one row a point: probability of instability with its confidence interval, quantiles of the metrics
+    picture   curve or heat map of a metric, with the border of mean-square stability
+
+Seeds are paired: under one seed all points with the same channel meet the same outages.
+"""
+
+METRICS = (
+    "settle_1cm_steps", "settle_2pct_steps", "overshoot", "iae", "ise", "peak", "final", "position_peak",
+    "position_final", "n_ul_max", "n_ul_mean",
+)  # fmt: skip
+"""Metrics of which a point has the median (_p50) and the 95th percentile (_p95) over the seeds."""

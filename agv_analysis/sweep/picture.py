@@ -1,0 +1,135 @@
+"""A sweep as a picture: a curve over one axis, a heat map over two, with the borders that theory draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
+from agv_analysis.sweep.plan import Axis, Sweep, SweepError, varied
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from agv_analysis.stability.chain import Chain
+
+BORDERS = {"mean square": "#d62728", "almost surely": "#ff9f1c"}
+"""Borders of stability along a straight track by name, with their colours."""
+
+_BORDER_VALUES = 40
+
+
+def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path) -> None:
+    """Draw a column of the rows to a PNG, SVG or PDF file.
+
+    Raises SweepError for a sweep that has neither one nor two axes of numbers, or if the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    if not can_draw(sweep):
+        raise SweepError(f"{path}: only one or two axes of numbers make a picture, this sweep has {len(sweep.axes)}")
+    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
+    axes = figure.add_subplot()
+    if len(sweep.axes) == 1:
+        _curve(axes, sweep, rows, metric)
+    else:
+        figure.colorbar(_heat_map(axes, sweep, rows, metric), label=_title(metric))
+    axes.set_title(f"{_title(metric)}, {max(row['runs'] for row in rows)} seeds a point", fontsize="medium")
+    try:
+        figure.savefig(path, dpi=130)
+    except (OSError, ValueError) as error:
+        raise SweepError(f"{path}: cannot be drawn to: {error}") from None
+
+
+def can_draw(sweep: Sweep) -> bool:
+    """Has the sweep one or two axes, of finite numbers?"""
+    return len(sweep.axes) in (1, 2) and all(
+        isinstance(value, (int, float)) and math.isfinite(value) for axis in sweep.axes for value in axis.values
+    )
+
+
+def _title(metric: str) -> str:
+    return "probability of instability" if metric == "instability" else metric
+
+
+def _curve(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) -> None:
+    (axis,) = sweep.axes
+    rows = sorted(rows, key=lambda row: float(row[axis.name]))
+    x = [row[axis.name] for row in rows]
+    axes.plot(x, [row[metric] for row in rows], ".-", color="#1f6fb4", label=_title(metric))
+    if metric == "instability":
+        low, high = ([row[f"instability_{end}"] for row in rows] for end in ("low", "high"))
+        axes.fill_between(x, low, high, color="#1f6fb4", alpha=0.2, label="95 % confidence")
+    fine = _between(axis)
+    for name, colour in BORDERS.items():
+        margin = margins(sweep.base, (axis,), [(value,) for value in fine])[name]
+        for before in np.flatnonzero(margin[:-1] * margin[1:] < 0.0):
+            axes.axvline(0.5 * (fine[before] + fine[before + 1]), color=colour, ls="--", label=f"border: {name}")
+    axes.set(xlabel=axis.label, ylabel=_title(metric))
+    axes.legend(fontsize="small")
+
+
+def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) -> Any:
+    across, up = sorted(sweep.axes, key=lambda axis: axis.name != "controller.kx")
+    x, y = sorted(across.values), sorted(up.values)
+    places = {(row[across.name], row[up.name]): row[metric] for row in rows}
+    heat = np.array([[places.get((i, j), np.nan) for i in x] for j in y], dtype=np.float64)
+    heat[np.isinf(heat)] = np.nan
+    low, high = (0.0, 1.0) if metric == "instability" else (None, None)
+    image = axes.pcolormesh(x, y, heat, shading="nearest", cmap="viridis", vmin=low, vmax=high)
+    fine = _between(across), _between(up)
+    found = margins(sweep.base, (across, up), [(i, j) for j in fine[1] for i in fine[0]])
+    for name, colour in BORDERS.items():
+        margin = np.ma.masked_invalid(found[name].reshape(len(fine[1]), len(fine[0])))
+        if margin.count() and margin.min() < 0.0 < margin.max():
+            axes.contour(*fine, margin, levels=[0.0], colors=colour, linestyles="--")
+            axes.plot([], [], color=colour, ls="--", label=f"border: {name}")
+            axes.legend(loc="upper right", fontsize="small")
+    axes.set(xlabel=across.label, ylabel=up.label)
+    return image
+
+
+def _between(axis: Axis) -> list[float]:
+    """Values of an axis for a smooth line: its own, if they are whole numbers, else as many as look smooth."""
+    if all(isinstance(value, int) for value in axis.values):
+        return sorted(axis.values)
+    fine: list[float] = np.linspace(min(axis.values), max(axis.values), _BORDER_VALUES).tolist()
+    return fine
+
+
+def margins(base: Scenario, axes: Sequence[Axis], points: Sequence[tuple[Any, ...]]) -> dict[str, Floats]:
+    """How far each point is from the borders of stability along a straight track: negative where it is stable.
+
+    By name of the border, shape (points,); NaN where theory is silent: another channel, losses on the downlink.
+
+    mean square:    T_s K_x (E[n_ul] + 1/2) - 1, for independent lengths of outages
+    almost surely:  the Lyapunov exponent E[log|1 - T_s K_x L|] / E[L], L steps from one reception to the next
+    """
+    found = np.array([_margins(varied(base, axes, point)) for point in points]).reshape(-1, 2)
+    return dict(zip(BORDERS, found.T, strict=True))
+
+
+def _margins(scenario: Scenario) -> tuple[float, float]:
+    from agv_analysis.stability.almost_sure import exponent_along
+
+    chain, a = _renewals(scenario), scenario.plant.ts * scenario.controller.kx
+    if chain is None:
+        return math.nan, math.nan
+    return a * (chain.mean_age + 0.5) - 1.0, exponent_along(a, chain)
+
+
+def _renewals(scenario: Scenario) -> Chain | None:
+    """The uplink as a chain whose outages have independent lengths; None if it is none, or the downlink loses, too."""
+    from agv_analysis.stability.chain import chain_of
+
+    uplink = scenario.relay.uplink
+    if scenario.relay.downlink.model != "perfect" or (
+        uplink.model == "gilbert_elliott" and (uplink.h, uplink.k) != (0.0, 1.0)
+    ):
+        return None
+    return chain_of(uplink)

@@ -1,0 +1,113 @@
+"""A sweep in one row a point: probability of instability, quantiles of the metrics."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.run import Floats
+from agv_analysis.simulation.batch import Table
+from agv_analysis.sweep import METRICS
+from agv_analysis.sweep.plan import Sweep, SweepError
+from agv_analysis.sweep.store import version
+
+CONFIDENCE = 0.95
+
+
+def instability(table: Table) -> NDArray[np.bool_]:
+    """Is each run unstable: does it not contract the distance of twins that meet the same losses?"""
+    return np.asarray(~(table["contraction"] < 1.0))
+
+
+def summarise(sweep: Sweep, table: Table, done: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    """One row a point with at least one run done; `table` and `done` have shape (points, seeds)."""
+    return [_row(sweep, point, table[point, done[point]]) for point in range(sweep.size) if done[point].any()]
+
+
+def _row(sweep: Sweep, point: int, runs: Table) -> dict[str, Any]:
+    unstable = int(np.count_nonzero(instability(runs)))
+    low, high = clopper_pearson(unstable, len(runs))
+    row: dict[str, Any] = {axis.name: value for axis, value in zip(sweep.axes, sweep.values(point), strict=True)}
+    row |= {
+        "runs": len(runs),
+        "unstable": unstable,
+        "instability": unstable / len(runs),
+        "instability_low": low,
+        "instability_high": high,
+        "diverged": int(np.count_nonzero(np.isinf(runs["contraction"]))),
+    }
+    for metric in METRICS:
+        p50, p95 = quantiles(runs[metric].astype(np.float64), metric.startswith("settle"))
+        row |= {f"{metric}_p50": p50, f"{metric}_p95": p95}
+    return row | {"first_seed": sweep.seeds[0], "version": version()}
+
+
+def quantiles(values: Floats, settling: bool) -> tuple[float, float]:
+    """Median and 95th percentile, values that occurred; a settling that did not happen (-1) counts as inf.
+
+    NaN where a metric is not defined in every run.
+    """
+    if settling:
+        values = np.where(values < 0.0, np.inf, values)
+    if np.isnan(values).any():
+        return math.nan, math.nan
+    p50, p95 = np.percentile(values, [50.0, 95.0], method="inverted_cdf")
+    return float(p50), float(p95)
+
+
+def clopper_pearson(hits: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Exact confidence interval of a probability after `hits` in `trials`.
+
+    Its ends are the probabilities under which as many hits, or as few, have probability (1 - confidence) / 2. Source:
+    Clopper and Pearson, Biometrika 26, 1934.
+    """
+    rest = (1.0 - confidence) / 2.0
+    low = 0.0 if hits == 0 else _crossing(lambda p: 1.0 - _at_most(hits - 1, trials, p) - rest)
+    high = 1.0 if hits == trials else _crossing(lambda p: rest - _at_most(hits, trials, p))
+    return low, high
+
+
+def _at_most(hits: int, trials: int, p: float) -> float:
+    """P(X <= hits) for X binomial, 0 < p < 1."""
+    k = np.arange(hits + 1)
+    ways = np.cumsum(np.log(np.concatenate(([1.0], (trials - k[:-1]) / k[1:]))))
+    return min(1.0, float(np.exp(ways + k * math.log(p) + (trials - k) * math.log1p(-p)).sum()))
+
+
+def _crossing(rising: Any) -> float:
+    """Zero of a rising function on (0, 1), by bisection to the last bit."""
+    low, high = 0.0, 1.0
+    while True:
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            return middle
+        low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)
+
+
+def write_rows(rows: list[dict[str, Any]], path: Path) -> None:
+    """Write rows to a .csv or a .parquet file. Raises SweepError if that cannot be done."""
+    try:
+        if path.suffix == ".parquet":
+            _write_parquet(rows, path)
+        else:
+            with open(path, "w", encoding="utf-8", newline="") as file:
+                writer = csv.DictWriter(file, list(rows[0]))
+                writer.writeheader()
+                writer.writerows(rows)
+    except OSError as error:
+        raise SweepError(f"{path}: cannot be written: {error}") from None
+
+
+def _write_parquet(rows: list[dict[str, Any]], path: Path) -> None:
+    try:
+        arrow: Any = importlib.import_module("pyarrow")
+        parquet: Any = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        raise SweepError(f"{path}: Parquet needs pyarrow: pip install pyarrow, or take --format csv") from None
+    parquet.write_table(arrow.Table.from_pylist(rows), path)
