@@ -137,7 +137,8 @@ def test_what_a_run_left_behind_is_not_taken_for_the_next_one_s(slot_first: bool
 
 def test_a_run_that_begins_with_an_unusable_message_does_not_go_on_with_the_last_run_s() -> None:
     join = SlotJoin[Message](START)
-    for event in [Message(t(0)), Slot(t(0), t(0), DELIVERED), t(0)]:
+    events: list[Message | int | Slot] = [Message(t(0)), Slot(t(0), t(0), DELIVERED), t(0)]
+    for event in events:
         list(feed(join, event))
     assert [one.message for one in join.add_slot(Slot(t(0), t(0), DELIVERED))] == [None]
 
