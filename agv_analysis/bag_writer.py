@@ -57,7 +57,7 @@ class BagWriter:
             raise UserError(f"{directory}: exists already; name a new directory or remove it first") from None
         except OSError as error:
             raise UserError(f"{directory}: cannot be recorded to: {error.strerror}") from None
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True)
+        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=f"agv_ncs {about.get('version', '')}".strip())
         self._writer.add_metadata(METADATA_NAME, about)
 

@@ -98,7 +98,8 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
             return node
 
         plant = add(PlantNode, connected.plant)
-        rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # `progress` says it already
+        for told_by_outcome in ("plant", "recorder"):
+            rclpy.logging.set_logger_level(told_by_outcome, rclpy.logging.LoggingSeverity.WARN)
         loop = [plant, *(add(NODES[name], getattr(connected, name)) for name in SCHEMAS if name != "plant")]
         recorder = None if bag is None else add(RecorderNode, _recording(scenario, bag, params))
         return _run_nodes(EXECUTORS[executor](context=context), plant, loop, recorder, stop, progress)

@@ -35,6 +35,8 @@ def _repeated(rows: NDArray[np.void], log_time: NDArray[np.int64], steps: NDArra
         return np.zeros(0, np.bool_)
     order = np.argsort(log_time, kind="stable") if (steps < 0).any() else np.arange(len(rows))
     same = np.flatnonzero(np.diff(log_time[order]) == 0)
+    if not len(same):
+        return np.zeros(0, np.bool_)
     earlier, later = rows[order[same]], rows[order[same + 1]]
     equal = np.ones(len(same), np.bool_)
     for name in rows.dtype.names or ():

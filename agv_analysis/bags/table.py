@@ -163,7 +163,7 @@ class Table:
             )
         old = self.rows
         self._capacity = max(rows, min(room, _MAX_ROOM // dtype.itemsize))
-        self._store = np.empty(self._capacity * dtype.itemsize, np.uint8)
+        self._store = np.zeros(self._capacity * dtype.itemsize, np.uint8)  # what pads a row is zero, too
         self._dtype = dtype
         new = self.rows
         if old.dtype == dtype:
