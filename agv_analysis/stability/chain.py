@@ -68,7 +68,8 @@ class Chain:
         while left > tail and len(found) < longest:
             state = state @ self.transition
             found.append(float(state @ self.delivery))
-            state, left = state * (1.0 - self.delivery), left - found[-1]
+            state = state * (1.0 - self.delivery)
+            left = float(state.sum())  # not 1 less what was found: its rounding alone would exceed the tail
         return np.array(found)
 
 
