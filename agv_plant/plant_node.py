@@ -1,7 +1,8 @@
 """The AGV: publishes its pose, obeys the commands that arrive, and keeps the loop's clock.
 
 lockstep: step k + 1 follows the answer to step k, as fast as it comes. realtime: one step every T_s, with the newest
-command held; the AGV stops when that is too old.
+command held; the AGV stops when that is too old. A command that arrives within a period acts on the whole of it, as it
+does in lockstep, where answers take no time.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -149,9 +150,10 @@ class LoopNode(Node, Generic[P]):
         self.report(self._last_ns)
 
     def flush(self, seconds: float) -> None:
-        """Wait until all that was published has arrived, `seconds` per output at most."""
+        """Wait until all that was published has arrived, `seconds` at most: who has died acknowledges nothing."""
+        deadline = time.monotonic() + seconds
         for output in self.outputs:
-            output.flush(seconds)
+            output.flush(max(0.0, deadline - time.monotonic()))
 
     # -- what went wrong ---------------------------------------------------------------------------------------------
 
