@@ -22,8 +22,11 @@ METADATA_NAME = "agv_ncs"
 _WINDOW = 1024
 """Messages that are held back to be ordered."""
 
-_BATCH = 8192
-"""Messages that are ordered and written at a time."""
+_BATCH = 256
+"""Messages that are written at a time: few, since a loop in real time in the same process waits meanwhile."""
+
+_CHUNK = 256 * 1024
+"""Size of a chunk [B], likewise."""
 
 _VERSION = 9  # of the metadata of rosbag2 in Jazzy
 
@@ -57,7 +60,9 @@ class BagWriter:
             raise UserError(f"{directory}: exists already; name a new directory or remove it first") from None
         except OSError as error:
             raise UserError(f"{directory}: cannot be recorded to: {error.strerror}") from None
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
+        self._writer = Writer(
+            self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
+        )
         self._writer.start(profile="ros2", library=f"agv_ncs {about.get('version', '')}".strip())
         self._writer.add_metadata(METADATA_NAME, about)
 
@@ -65,17 +70,18 @@ class BagWriter:
         """Add a message to the topic with this number."""
         self._pending.append((log_time_ns, topic, data, publish_time_ns))
         self.counts[topic] += 1
-        if len(self._pending) >= _BATCH:
+        if len(self._pending) >= _WINDOW + _BATCH:
             self._write_all_but(_WINDOW)
 
     def close(self) -> None:
         """Write what is held back, the index and metadata.yaml."""
         self._write_all_but(0)
-        metadata = self._metadata()
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": _dump(metadata)})
+        topics = list(zip(self._topics, self.counts, strict=True))
+        metadata = rosbag2_metadata(self._file_name, self._first_ns, self._last_ns, topics)
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata_text(metadata)})
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.close()
-        text = _dump({"rosbag2_bagfile_information": metadata})
+        text = metadata_text({"rosbag2_bagfile_information": metadata})
         (self._directory / "metadata.yaml").write_text(text, encoding="utf-8")
 
     def _write_all_but(self, newest: int) -> None:
@@ -97,35 +103,34 @@ class BagWriter:
             self._topics.append(topic)
             if topic.type not in schemas:
                 schemas[topic.type] = self._writer.register_schema(topic.type, "ros2msg", topic.schema.encode())
-            about = {"offered_qos_profiles": _dump(topic.offered_qos), "topic_type_hash": topic.type_hash}
+            about = {"offered_qos_profiles": metadata_text(topic.offered_qos), "topic_type_hash": topic.type_hash}
             self._writer.register_channel(topic.name, "cdr", schemas[topic.type], about)
 
-    def _metadata(self) -> dict[str, Any]:
-        start = {"nanoseconds_since_epoch": self._first_ns}
-        duration = {"nanoseconds": self._last_ns - self._first_ns}
-        file = {
-            "path": self._file_name,
-            "starting_time": start,
-            "duration": duration,
-            "message_count": sum(self.counts),
-        }
-        return {
-            "version": _VERSION,
-            "storage_identifier": "mcap",
-            "duration": duration,
-            "starting_time": start,
-            "message_count": sum(self.counts),
-            "topics_with_message_count": [
-                {"topic_metadata": _topic_metadata(topic), "message_count": count}
-                for topic, count in zip(self._topics, self.counts, strict=True)
-            ],
-            "compression_format": "",
-            "compression_mode": "",
-            "relative_file_paths": [self._file_name],
-            "files": [file],
-            "custom_data": None,
-            "ros_distro": "jazzy",
-        }
+
+def rosbag2_metadata(
+    file_name: str, first_ns: int, last_ns: int, topics: Sequence[tuple[TopicInfo, int]]
+) -> dict[str, Any]:
+    """What metadata.yaml says of a bag of one MCAP file; `topics` with their number of messages."""
+    start = {"nanoseconds_since_epoch": first_ns}
+    duration = {"nanoseconds": last_ns - first_ns}
+    total = sum(count for _, count in topics)
+    file = {"path": file_name, "starting_time": start, "duration": duration, "message_count": total}
+    return {
+        "version": _VERSION,
+        "storage_identifier": "mcap",
+        "duration": duration,
+        "starting_time": start,
+        "message_count": total,
+        "topics_with_message_count": [
+            {"topic_metadata": _topic_metadata(topic), "message_count": count} for topic, count in topics
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file_name],
+        "files": [file],
+        "custom_data": None,
+        "ros_distro": "jazzy",
+    }
 
 
 def _topic_metadata(topic: TopicInfo) -> dict[str, Any]:
@@ -145,5 +150,6 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def _dump(content: Any) -> str:
+def metadata_text(content: Any) -> str:
+    """YAML as rosbag2 reads it."""
     return yaml.dump(content, Dumper=_Dumper, sort_keys=False)
