@@ -141,3 +141,15 @@ def test_work_is_parted_without_gap_or_overlap(rows: int, columns: int, workers:
     units = _Batch(ONE * rows, range(columns), twins=False).units(workers)
     assert sorted(job for unit in units for job in unit) == [(i, j) for i in range(rows) for j in range(columns)]
     assert len(units) >= min(rows * columns // 2, workers)
+
+
+def test_a_track_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
+    file = tmp_path / "track.csv"
+    settings = ["error_detector.track=csv", f"error_detector.track_file={file}", "plant.duration=1.0"]
+    file.write_text("t,v,w\n0,1,0\n100,1,0\n")
+    scenario = load_scenario(OUTAGES, settings)
+    slow = simulate_batch([scenario], [1])["final"][0, 0]
+    file.write_text("t,v,w\n0,2.5,0\n100,2.5,0\n")
+    fast = simulate_batch([scenario], [1])["final"][0, 0]
+    run = simulate(scenario)
+    assert fast == run.reference[-1, 1] - run.pose[-1, 1] != slow

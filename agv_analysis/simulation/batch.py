@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import groupby, zip_longest
+from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
@@ -86,9 +87,6 @@ class _Batch:
         tracks: dict[tuple[ErrorDetectorParameters, int], int] = {}
         kinds = [(scenario.error_detector, steps) for scenario, steps in zip(scenarios, self._steps, strict=True)]
         self._track = [tracks.setdefault(kind, len(tracks)) for kind in kinds]
-        self._reference = functools.lru_cache(maxsize=16)(
-            lambda row: numbers(Reference(scenarios[row].error_detector).first(self._steps[row]))
-        )
 
     def units(self, workers: int) -> list[list[Job]]:
         """All runs in parts, several for each worker so that none waits long for another; seed after seed."""
@@ -121,6 +119,10 @@ class _Batch:
             twin = at_rest(*(value + TWIN_OFFSET for value in self._scenarios[job[0]].plant.initial_pose))
             yield job, *compiled(statistics_of_twins)(reference, self._case(job, airs), twin)
 
+    def _reference(self, row: int) -> Floats:
+        detector = self._scenarios[row].error_detector
+        return _reference(detector, self._steps[row], _edition(detector.track_file))
+
     def _case(self, job: Job, airs: Airs) -> Case:
         row, column = job
         scenario, air = self._scenarios[row], airs(self._seeds[column], self._steps[row])
@@ -130,3 +132,19 @@ class _Batch:
             at_rest(*scenario.plant.initial_pose),
             settings_of(scenario),
         )
+
+
+@functools.lru_cache(maxsize=8)
+def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -> Floats:
+    """A reference track's first steps; kept, since the parts of a sweep ask for the same one again and again."""
+    reference: Floats = numbers(Reference(detector).first(steps))
+    return reference
+
+
+def _edition(path: str) -> object:
+    """What changes when a file does; None if there is no such file."""
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size

@@ -45,14 +45,14 @@ def on_dask(sweep: Sweep, parts: Sequence[Part], address: str) -> Results:
     A part that is lost with its worker is done by another one. Raises SweepError if the cluster cannot be used.
     """
     with _client(address) as client:
-        shared = client.scatter(sweep, broadcast=True)
         waiting = iter(parts)
         ahead = _PARTS_AHEAD * max(1, sum(client.nthreads().values()))
 
         def submit(part: Part) -> Any:
-            return client.submit(_numbered, shared, part, pure=False, retries=_RETRIES)
+            return client.submit(_numbered, sweep, part, pure=False, retries=_RETRIES)
 
-        futures = _distributed().as_completed([submit(part) for part in itertools.islice(waiting, ahead)])
+        first = [submit(part) for part in itertools.islice(waiting, ahead)]
+        futures = _distributed().as_completed(first, loop=client.loop)
         for future in futures:
             yield future.result()
             for part in itertools.islice(waiting, 1):
