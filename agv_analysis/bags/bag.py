@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,7 +40,7 @@ class Topic:
 
 
 @dataclass(frozen=True)
-class Bag(Mapping[str, NDArray[np.void]]):
+class Bag:
     """A recording: `bag[topic]` is a structured array, one row for each message, in file order.
 
     Its fields are `log_time_ns`, `publish_time_ns` [ns], and one for each value of the message by its dotted path:
@@ -57,13 +57,14 @@ class Bag(Mapping[str, NDArray[np.void]]):
     """Everything that was lost, could not be checked, or is not as it should be; in words, with counts."""
     is_complete: bool
     """Is nothing known to be missing?"""
-    _arrays: dict[str, NDArray[np.void]] = field(repr=False)
+    arrays: dict[str, NDArray[np.void]] = field(repr=False)
+    """The topics that were asked for and could be decoded; `bag[topic]` says of the others why they are not here."""
     _refusals: dict[str, str] = field(repr=False)
 
     def __getitem__(self, topic: str) -> NDArray[np.void]:
         """Messages of a topic. Raises BagError if it is not in the bag, was not asked for, or cannot be decoded."""
-        if topic in self._arrays:
-            return self._arrays[topic]
+        if topic in self.arrays:
+            return self.arrays[topic]
         if topic in self._refusals:
             raise BagError(f"{self.path}: {topic}: {self._refusals[topic]}; its bytes are in payloads({topic!r})")
         if topic in self.topics:
@@ -71,13 +72,7 @@ class Bag(Mapping[str, NDArray[np.void]]):
         raise BagError(f"{self.path}: no topic {topic}; it has {', '.join(sorted(self.topics)) or 'none'}")
 
     def __contains__(self, topic: object) -> bool:
-        return topic in self._arrays
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)
+        return topic in self.arrays
 
     def payloads(self, topic: str) -> list[bytes]:
         """The messages of a topic as they were sent (CDR), in file order; reads the file again.

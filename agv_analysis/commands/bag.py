@@ -1,0 +1,130 @@
+"""`agv-ncs bag`: what is in a recording, what is wrong with it, and how to get it out."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from agv_analysis.commands import write_json
+
+if TYPE_CHECKING:
+    from agv_analysis.bags import Bag
+
+_LONG = 2**28
+"""Bags of more bytes than this are read under a progress bar."""
+
+
+@click.group("bag")
+def command() -> None:
+    """Look into a recording, export it, or recover what is whole in a damaged one.
+
+    A BAG is a rosbag2 directory or a bare .mcap or .db3 file.
+    """
+
+
+@command.command("info")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+def info(bag: Path, json_file: Path | None) -> None:
+    """Say what BAG holds, and everything that is wrong with it.
+
+    Reads and decodes every message. The exit status is 1 only if nothing can be read.
+
+    \b
+    Examples:
+      agv-ncs bag info bags/first
+      agv-ncs bag info someone_elses.mcap --json info.json
+    """
+    from agv_analysis.bags import read_bag
+    from agv_analysis.bags.summary import describe
+
+    with _bar(bag, "reading") as progress:
+        content = read_bag(bag, progress=progress)
+    summary = describe(content)
+    for line in summary.lines():
+        click.echo(line)
+    if json_file is not None:
+        write_json(json_file, summary.to_json())
+
+
+@command.command("export")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--csv", "form", flag_value="csv", help="One CSV file for each topic, in the directory OUT.")
+@click.option("--parquet", "form", flag_value="parquet", help="One Parquet file for each topic, in the directory OUT.")
+@click.option("--npz", "form", flag_value="npz", help="One file OUT of numpy arrays.")
+@click.option("--topic", "topics", multiple=True, help="Only this topic. May be repeated.")
+@click.option("--out", "-o", type=click.Path(path_type=Path), help="Where to; by default beside BAG.")
+def export(bag: Path, form: str | None, topics: tuple[str, ...], out: Path | None) -> None:
+    """Write the messages of BAG for other programs: one row a message, one column a value.
+
+    \b
+    Examples:
+      agv-ncs bag export bags/first --csv --topic /agv/pose
+      agv-ncs bag export bags/first --npz --out first.npz
+    """
+    from agv_analysis.bags.export import EXPORTS
+
+    if form is None:
+        raise click.UsageError(f"say in which form: {', '.join(f'--{name}' for name in EXPORTS)}")
+    content = _read(bag, topics)
+    where = out or bag.with_name(f"{bag.name}_{form}" if form != "npz" else f"{bag.name}.npz")
+    for path in EXPORTS[form](content, where):
+        click.echo(path)
+    _warn(content.problems, content.is_complete)
+
+
+def _read(bag: Path, topics: tuple[str, ...]) -> Bag:
+    """The topics that are asked for, each of which must be there and decodable; all that are, if none is."""
+    from agv_analysis.bags import read_bag
+
+    with _bar(bag, "reading") as progress:
+        content = read_bag(bag, topics or None, progress)
+    for topic in topics:
+        content[topic]
+    return content
+
+
+@command.command("recover")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+def recover(bag: Path, out: Path) -> None:
+    """Write everything that is whole in BAG to a clean bag OUT, and say what is missing.
+
+    OUT becomes an MCAP file if its name ends in .mcap, else a rosbag2 directory.
+
+    \b
+    Example:
+      agv-ncs bag recover bags/interrupted bags/recovered
+    """
+    from agv_analysis.bags.recover import recover as recover_bag
+
+    with _bar(bag, "copying") as progress:
+        recovery = recover_bag(bag, out, progress)
+    for topic, count in recovery.counts.items():
+        click.echo(f"{topic}: {count} messages")
+    click.echo(f"{out}: {sum(recovery.counts.values())} messages")
+    _warn(recovery.problems, recovery.is_complete)
+
+
+def _warn(problems: tuple[str, ...], is_complete: bool) -> None:
+    for problem in problems:
+        click.echo(problem, err=True)
+    if not is_complete:
+        click.echo("the recording is not complete", err=True)
+
+
+@contextlib.contextmanager
+def _bar(bag: Path, what: str) -> Iterator[Callable[[int], None] | None]:
+    """A progress bar in percent for bags that take long."""
+    from agv_analysis.progress import step_bar
+
+    files = [bag] if bag.is_file() else [file for file in bag.glob("*") if file.is_file()]
+    if sum(file.stat().st_size for file in files) < _LONG:
+        yield None
+        return
+    with step_bar(100, what) as progress:
+        yield progress
