@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from agv_analysis.bag_writer import BagWriter, TopicInfo
 from agv_analysis.message_schema import schema_of
 from agv_analysis.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
+from agv_analysis.version import version
 from agv_ros.executor import run_node
 from agv_ros.node import ENDED, PUBLISHED, LoopNode
 from agv_ros.wire import stamp_of
@@ -131,14 +131,10 @@ class RecorderNode(LoopNode[RecorderParameters]):
 
 def _about(params_file: str) -> dict[str, str]:
     """What is embedded in the bag: version, and the run's parameters and seed if they are known. Raises UserError."""
-    try:
-        version = metadata.version("agv_ncs")
-    except metadata.PackageNotFoundError:
-        version = "not installed"
     if not params_file:
-        return {"version": version}
+        return {"version": version()}
     scenario = load_scenario(params_file)
-    return {"version": version, "seed": str(scenario.relay.seed), "params": scenario.to_yaml()}
+    return {"version": version(), "seed": str(scenario.relay.seed), "params": scenario.to_yaml()}
 
 
 def _qos(profile: QoSProfile) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from agv_analysis.simulation import STATISTICS
 from agv_analysis.simulation.batch import Table
 from agv_analysis.sweep.plan import Part, Sweep, SweepError
+from agv_analysis.version import version
 
 
 class Store:
@@ -60,14 +60,6 @@ class Store:
 
 def _shape(part: Part) -> tuple[int, int]:
     return part.points[1] - part.points[0], part.seeds[1] - part.seeds[0]
-
-
-def version() -> str:
-    """Version of this package, as results carry it."""
-    try:
-        return metadata.version("agv_ncs")
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def describe(sweep: Sweep) -> dict[str, Any]:

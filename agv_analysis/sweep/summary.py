@@ -15,7 +15,7 @@ from agv_analysis.run import Floats
 from agv_analysis.simulation.batch import Table
 from agv_analysis.sweep import METRICS
 from agv_analysis.sweep.plan import Sweep, SweepError
-from agv_analysis.sweep.store import version
+from agv_analysis.version import version
 
 CONFIDENCE = 0.95
 
