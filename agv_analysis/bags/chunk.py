@@ -82,9 +82,9 @@ def rescue_chunk(length: int, left: int, read: Read) -> tuple[Chunk, int] | None
 
     `length` is what the record says of its own length, `left` what the file holds from its content on, which `read`
     gives. A way to read the lengths counts if the CRC proves what comes out, or, where there is no CRC, if that fills
-    the declared size and consists of whole records.
+    the declared size and consists of whole records. The shortest is tried first: what is compressed knows its own end.
     """
-    for head, begin, end in _readings(length, left, read):
+    for head, begin, end in sorted(_readings(length, left, read), key=lambda reading: reading[2]):
         chunk = head._replace(content=read(begin, end - begin))
         try:
             inflated = open_chunk(chunk)
@@ -172,8 +172,11 @@ def _definitions(content: bytes, position: int, end: int) -> list[Definition] | 
     return found if position == end else None
 
 
-def walk(content: bytes) -> Content:
-    """Messages of a chunk without its index, from record to record; what is no record is passed over."""
+def walk(content: bytes, is_cut: bool = False) -> Content:
+    """Messages of a chunk without its index, from record to record; what is no record is passed over.
+
+    `is_cut`: the content ends anywhere, so that its last record need not be whole.
+    """
     starts: list[int] = []
     definitions: list[Definition] = []
     position, lost = 0, 0
@@ -189,7 +192,8 @@ def walk(content: bytes) -> Content:
             continue
         suspect = run[-1] if run else None
         after = next_message(content, position if suspect is None else suspect)
-        if suspect is not None and is_wrong_length(suspect, position, after):
+        is_rest = is_cut and after == len(content)
+        if suspect is not None and not is_rest and is_wrong_length(suspect, position, after):
             position = starts.pop()
         lost += after - position
         position = after

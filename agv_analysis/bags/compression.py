@@ -27,7 +27,7 @@ def inflate(compression: str, content: bytes, size: int) -> bytes:
         raise DamagedError(f"compression {compression[:20]!r} is not known; known are zstd, lz4 and none")
     if not content and not size:
         return b""
-    if declared_size(compression, content) == size:
+    if compression == "zstd" and _zstd_size(content) == size:
         return _whole_zstd(content)
     inflated = inflate_start(compression, content, size + 1)
     if len(inflated) > size:
@@ -54,9 +54,13 @@ def inflate_start(compression: str, content: bytes, limit: int) -> bytes:
 
 
 def declared_size(compression: str, content: bytes) -> int | None:
-    """Size that a zstd frame itself declares, None if it does not. Raises DamagedError if it is no such frame."""
-    if compression != "zstd":
-        return None
+    """Size that compressed content itself declares, None if it does not. Raises DamagedError if it is none."""
+    if compression == "zstd":
+        return _zstd_size(content)
+    return _lz4_size(content) if compression == "lz4" else None
+
+
+def _zstd_size(content: bytes) -> int | None:
     import zstandard
 
     try:
@@ -64,6 +68,15 @@ def declared_size(compression: str, content: bytes) -> int | None:
     except zstandard.ZstdError as error:
         raise DamagedError(f"zstd: {error}") from None
     return None if size == zstandard.CONTENTSIZE_UNKNOWN else int(size)
+
+
+def _lz4_size(content: bytes) -> int | None:
+    import lz4.frame
+
+    try:
+        return lz4.frame.get_frame_info(content)["content_size"] or None
+    except RuntimeError as error:
+        raise DamagedError(f"lz4: {error}") from None
 
 
 def compression_of(content: bytes) -> str:

@@ -166,7 +166,7 @@ class McapFile:
                 buffer = np.frombuffer(item.content, np.uint8)
                 yield from self._split(buffer, messages_at(buffer, np.array(item.starts, np.int64)), is_wanted)
             elif isinstance(item, _Cut):
-                yield from self._content(item.position, item.content, walk(item.content), False, is_wanted)
+                yield from self._content(item.position, item.content, walk(item.content, is_cut=True), False, is_wanted)
             elif opened is not None:
                 yield from self._unpack(item, opened, is_wanted)
         self.position = self.size
