@@ -37,7 +37,7 @@ class Chain:
     @property
     def loss_rate(self) -> float:
         """Share of slots that are lost."""
-        return float(self.stationary @ (1.0 - self.delivery))
+        return min(1.0, max(0.0, float(self.stationary @ (1.0 - self.delivery))))  # rounding may leave [0, 1]
 
     @property
     def mean_burst(self) -> float:

@@ -1,0 +1,79 @@
+"""`agv-ncs stability`: margins of a scenario, without a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from agv_analysis.commands import with_settings, write_json
+
+if TYPE_CHECKING:
+    from agv_analysis.stability.margins import Margins
+
+
+@click.command("stability")
+@with_settings
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+def command(params: str, settings: tuple[str, ...], json_file: Path | None) -> None:
+    """Say how much the loop of the params file PARAMS can take, by each criterion, and where they disagree.
+
+    \b
+    Examples:
+      agv-ncs stability config/paper.yaml
+      agv-ncs stability config/outages.yaml --set controller.kx=5.0 --set error_detector.track=line --json margins.json
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from agv_analysis.scenario import load_scenario
+    from agv_analysis.stability.margins import margins
+
+    scenario = load_scenario(params, settings)
+    console = Console(highlight=False)
+    with Console(stderr=True).status("computing the margins ..."):
+        found = margins(scenario)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for name, value in _rows(found, scenario.plant.ts):
+        table.add_row(name, value)
+    console.print(table)
+    for sentence in found.disagreements():
+        console.print(f"[bold yellow]They disagree:[/] {sentence}.")
+    if json_file is not None:
+        write_json(json_file, found.to_json())
+
+
+def _rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
+    def told(value: float | None, name: str, text: str) -> str:
+        reason = found.reasons.get(name)
+        if value is None:
+            return f"no bound: {reason}"
+        return text if reason is None else f"{text} ({reason})"
+
+    def steps(n: int | None) -> str:
+        if n is not None and n < 0:
+            return "does not contract even without outages"
+        return f"{n} steps ({n * ts * 1e3:g} ms)" if n is not None else ""
+
+    yield "Paper's test, constant n_ul", told(found.n_paper, "n_max.paper", steps(found.n_paper))
+    yield "Pose always n steps old", told(found.n_lifted, "n_max.lifted", steps(found.n_lifted))
+    yield "Any outages up to n", told(found.n_bursts, "n_max.bursts", steps(found.n_bursts))
+    p = found.p_mean_square
+    yield "Independent losses, mean square", told(p, "p_max.mean_square", _probability(p))
+    p = found.p_almost_sure
+    yield "Independent losses, almost surely", told(p, "p_max.almost_sure", _probability(p))
+    rate = "" if found.loss_rate is None else f" at a loss rate of {found.loss_rate:.4g}"
+    burst = found.burst_mean_square
+    text = "" if burst is None else "no burst is short enough" if burst < 0 else f"{burst:.4g} slots on average"
+    yield f"Bursts, mean square{rate}", told(burst, "burst_max.mean_square", text)
+    yield "What binds", "nothing" if found.binding is None else f"the error {found.binding} the track"
+
+
+def _probability(p: float | None) -> str:
+    if p is None:
+        return ""
+    return "does not contract even without losses" if p < 0.0 else f"below {p:.5g}"

@@ -1,0 +1,171 @@
+"""How much a scenario can take: the largest outage, loss probability and burst by each criterion, and what binds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
+from agv_analysis.stability import almost_sure, bursts, floquet, mean_square, paper
+from agv_analysis.stability.chain import chain_of
+from agv_cloud.parameters import ControllerParameters
+from agv_cloud.reference import Reference, lap_steps
+
+ALONG, ACROSS = "along", "across"
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Margins of a loop on its track. None: there is no bound, or none could be found; `reasons` says which and why."""
+
+    n_paper: int | None
+    """Largest constant n_ul for which the paper's test holds at every step of a lap."""
+    n_lifted: int | None
+    """Largest constant n_ul under which a lap contracts every small error."""
+    n_bursts: int | None
+    """Most consecutive losses, in any order, as often as nature likes, under which the loop is proved to contract."""
+    p_mean_square: float | None
+    """Probability of independent losses below which E[e^2] dies out."""
+    p_almost_sure: float | None
+    """Probability of independent losses below which almost every run converges."""
+    loss_rate: float | None
+    """Loss rate of the scenario's uplink, None for a channel without a closed form."""
+    burst_mean_square: float | None
+    """Mean burst [slots] at that loss rate, below which E[e^2] dies out."""
+    binding: str | None
+    """Which error the bursts blow up first: `along` the track or `across` it."""
+    reasons: dict[str, str] = field(default_factory=dict)
+    """Why a margin is None, by its name in `to_json`."""
+
+    def disagreements(self) -> list[str]:
+        """A sentence for each pair of criteria that say different things."""
+        found = []
+        if self.n_lifted is not None and (self.n_paper is None or self.n_paper > self.n_lifted):
+            said = "any number" if self.n_paper is None else f"up to {self.n_paper}"
+            found.append(
+                f"the paper's test allows {said} of outages; a pose that is always {_steps(self.n_lifted + 1)} old "
+                "makes the error grow"
+            )
+        if self.n_paper is not None and self.n_bursts is not None and self.n_paper < self.n_bursts:
+            found.append(
+                "the paper's test calls the loop unstable "
+                + ("even without outages" if self.n_paper < 0 else f"beyond {self.n_paper} outages")
+                + f"; it contracts under any outages of up to {self.n_bursts} slots"
+            )
+        if self.n_lifted is not None and self.n_bursts is not None and self.n_bursts > self.n_lifted:
+            found.append(
+                f"outages of up to {self.n_bursts} slots are survived, since a fresh pose follows each; a pose that is "
+                f"always {_steps(self.n_lifted + 1)} old is not"
+            )
+        if (
+            self.p_mean_square is not None
+            and self.p_almost_sure is not None
+            and self.p_almost_sure > self.p_mean_square
+        ):
+            found.append(
+                f"between {self.p_mean_square:.4f} and {self.p_almost_sure:.4f} of independent losses almost every run "
+                "converges, but the mean square of the error grows: rare long outages dominate it"
+            )
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """The margins by name, beside each that is null its reason."""
+        tree: dict[str, dict[str, Any]] = {
+            "n_max": {"paper": self.n_paper, "lifted": self.n_lifted, "bursts": self.n_bursts},
+            "p_max": {"mean_square": self.p_mean_square, "almost_sure": self.p_almost_sure},
+            "burst_max": {"mean_square": self.burst_mean_square},
+        }
+        for group, values in tree.items():
+            for name in list(values):
+                if f"{group}.{name}" in self.reasons:
+                    values[f"{name}_reason"] = self.reasons[f"{group}.{name}"]
+        return {**tree, "loss_rate": self.loss_rate, "binding": self.binding, "disagreements": self.disagreements()}
+
+
+def _steps(n: int) -> str:
+    return "1 step" if n == 1 else f"{n} steps"
+
+
+def margins(scenario: Scenario) -> Margins:
+    """Margins of a scenario over one lap of its track. Raises TrackFileError if the track's file cannot be used.
+
+    They are those of the loop linearised about its reference: a limit on the speed bounds what is unstable, it does
+    not stabilise it.
+    """
+    ts, gains, reasons = scenario.plant.ts, scenario.controller, {}
+    reference = Reference(scenario.error_detector).first(_lap(scenario))
+    theta, v_r, w_r = reference[:, 2], reference[:, 3], reference[:, 4]
+    n_paper = paper.largest_n(theta, v_r, gains, ts)
+    if n_paper is None:
+        reasons["n_max.paper"] = (
+            "the test holds for every n: it sees an outdated pose only by how far the heading has turned since"
+        )
+    n_lifted = floquet.largest_constant_delay(v_r, w_r, gains, ts)
+    if n_lifted is None:
+        reasons["n_max.lifted"] = "the lap contracts for every n that was tried, up to 10000"
+    n_bursts, refuted = bursts.largest_n(v_r, w_r, gains, ts)
+    if n_bursts is None:
+        reasons["n_max.bursts"] = "every burst that was tried contracts, up to 1000 slots"
+    elif refuted is not None and refuted > n_bursts + 1:
+        reasons["n_max.bursts"] = f"proved up to {n_bursts}, refuted from {refuted} on, between them undecided"
+    p_almost_sure = almost_sure.critical_loss(v_r, w_r, gains, ts)
+    if p_almost_sure is None:
+        reasons["p_max.almost_sure"] = "almost every run converges at every loss probability up to 0.999"
+    if almost_sure.is_degenerate(ts * gains.kx) and not np.any(w_r):
+        reasons.setdefault(
+            "p_max.almost_sure",
+            "1 / (T_s K_x) is an integer: on a straight track some burst brings the error along it to 0 at one stroke",
+        )
+    loss_rate, burst = _burst(scenario, v_r, w_r, reasons)
+    return Margins(
+        n_paper=n_paper,
+        n_lifted=n_lifted,
+        n_bursts=n_bursts,
+        p_mean_square=mean_square.critical_loss(v_r, w_r, gains, ts),
+        p_almost_sure=p_almost_sure,
+        loss_rate=loss_rate,
+        burst_mean_square=burst,
+        binding=binding(float(np.abs(v_r).max()), gains, ts),
+        reasons=reasons,
+    )
+
+
+def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
+    """Which error bursts blow up first at the speed `v` [m/s]: along or across the track; None if neither ever."""
+    along = bursts.largest_n_along(ts * gains.kx)
+    across = bursts.largest_n_across(v, gains, ts)
+    if along is None and across is None:
+        return None
+    if across is None or (along is not None and along <= across):
+        return ALONG
+    return ACROSS
+
+
+def _lap(scenario: Scenario) -> int:
+    """Steps of one lap; of a track from a file, those of the run."""
+    steps = lap_steps(scenario.error_detector)
+    if scenario.error_detector.track == "csv" and math.isfinite(scenario.plant.duration):
+        steps = round(scenario.plant.duration / scenario.plant.ts)
+    return max(1, steps)
+
+
+def _burst(scenario: Scenario, v_r: Floats, w_r: Floats, reasons: dict[str, str]) -> tuple[float | None, float | None]:
+    """Loss rate of the scenario's uplink, and the critical mean burst at it."""
+    chain = chain_of(scenario.relay.uplink)
+    loss_rate = None if chain is None else chain.loss_rate
+    name = "burst_max.mean_square"
+    if loss_rate is None:
+        reasons[name] = f"the loss rate of the channel {scenario.relay.uplink.model} has no closed form"
+        return None, None
+    if not 0.0 < loss_rate < 1.0:
+        reasons[name] = f"the scenario's uplink loses {'nothing' if loss_rate == 0.0 else 'everything'}"
+        return loss_rate, None
+    found = mean_square.critical_burst(loss_rate, v_r, w_r, scenario.controller, scenario.plant.ts)
+    if math.isinf(found):
+        reasons[name] = "bursts of a million slots on average are not too long"
+        return loss_rate, None
+    return loss_rate, found
