@@ -75,17 +75,17 @@ class Layouts:
         if not len(batch):
             return []
         if (sizes == sizes[0]).all():
-            return list(self._of_size(batch, np.arange(len(batch)), int(sizes[0])))
+            return list(self._grouped(gather(batch.buffer, batch.starts, int(sizes[0])), np.arange(len(batch))))
         return [
             group
             for size in np.unique(sizes).tolist()
-            for group in self._of_size(batch, np.flatnonzero(sizes == size), size)
+            for places in [np.flatnonzero(sizes == size)]
+            for group in self._grouped(gather(batch.buffer, batch.starts[places], size), places)
         ]
 
-    def _of_size(self, batch: Batch, places: Ints, size: int) -> Iterator[Group]:
-        """Groups of the messages at `places`, all of which have `size` bytes."""
-        messages = gather(batch.buffer, batch.starts[places], size)
-        layout = self._latest.get(size)
+    def _grouped(self, messages: Bytes, places: Ints) -> Iterator[Group]:
+        """Groups of messages, shape (n, size), from those places of a batch."""
+        layout = self._latest.get(messages.shape[1])
         while len(places):
             layout = layout or self._trace(messages[0].tobytes())
             if layout is None:

@@ -104,6 +104,15 @@ class _Packed(NamedTuple):
     """Of its messages, as its message indexes name them."""
 
 
+class _Opened(NamedTuple):
+    """A chunk, inflated."""
+
+    content: bytes
+    found: Content
+    is_by_index: bool
+    """Were its messages found by their message indexes?"""
+
+
 class _Cut(NamedTuple):
     """What is left of a chunk within which the file ends."""
 
@@ -383,10 +392,10 @@ class McapFile:
 
     # -- chunks ------------------------------------------------------------------------------------------------------
 
-    def _unpack(self, packed: _Packed, opened: Future[bytes], is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
+    def _unpack(self, packed: _Packed, opened: Future[_Opened], is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         chunk, position = packed.chunk, packed.position
         try:
-            content = opened.result()
+            content, found, is_by_index = opened.result()
         except DamagedError as error:
             number = sum(map(len, packed.places))
             self.findings.add(f"damaged chunk, left out ({error})", at=position, messages=number, is_loss=True)
@@ -395,11 +404,8 @@ class McapFile:
             self.findings.add("chunk without a CRC, whose content is not checked")
         elif not is_as_declared(chunk, content):
             self.findings.add("chunk that misstates its size or compression, read all the same", at=position)
-        found = find(content, packed.places)
-        if found is None:
-            found = walk(content)
-            if packed.places:
-                self.findings.add("message index that does not fit its chunk, not used", at=position)
+        if packed.places and not is_by_index:
+            self.findings.add("message index that does not fit its chunk, not used", at=position)
         yield from self._content(position, content, found, chunk.crc != 0, is_wanted)
 
     def _content(
@@ -424,12 +430,19 @@ class McapFile:
                 yield channel, Batch(buffer, mine.starts + lead, mine.lengths - (MESSAGE_HEAD - LEAD))
 
 
-def _ahead(items: Iterator[_Run | _Packed | _Cut]) -> Iterator[tuple[_Run | _Packed | _Cut, Future[bytes] | None]]:
+def _open(packed: _Packed) -> _Opened:
+    """Inflate and check a chunk, and find its messages. Raises DamagedError."""
+    content = open_chunk(packed.chunk)
+    found = find(content, packed.places)
+    return _Opened(content, found or walk(content), found is not None)
+
+
+def _ahead(items: Iterator[_Run | _Packed | _Cut]) -> Iterator[tuple[_Run | _Packed | _Cut, Future[_Opened] | None]]:
     """The same items, a few chunks ahead being opened on another thread."""
-    waiting: deque[tuple[_Run | _Packed | _Cut, Future[bytes] | None]] = deque()
+    waiting: deque[tuple[_Run | _Packed | _Cut, Future[_Opened] | None]] = deque()
     with ThreadPoolExecutor(1, "bag") as pool:
         for item in items:
-            opened = pool.submit(open_chunk, item.chunk) if isinstance(item, _Packed) else None
+            opened = pool.submit(_open, item) if isinstance(item, _Packed) else None
             waiting.append((item, opened))
             ahead = sum(min(item.chunk.size, MAX_CHUNK) for item, _ in waiting if isinstance(item, _Packed))
             while waiting and (len(waiting) > _AHEAD or ahead > _AHEAD_BYTES):
