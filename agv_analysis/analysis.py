@@ -1,4 +1,4 @@
-"""What a run says: outages, convergence, and whether the loop is stable by three criteria that need not agree."""
+"""What a run says: outages, convergence, whether the loop is stable by criteria that need not agree, and a verdict."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.channel_fit import ChannelFit, fit_channel
 from agv_analysis.convergence import Convergence, convergence
 from agv_analysis.outages import Outages, outages
-from agv_analysis.run import Run
-from agv_analysis.stability import bursts, lifted, paper
+from agv_analysis.run import Floats, Run
+from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
+from agv_analysis.stability.verdict import Verdict, judge
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,15 @@ class Analysis:
     """Largest spectral radius of the lifted system over the track, for a pose as old as the oldest of the run."""
     bursts: BurstVerdict
     """Verdict for arbitrary bursts of up to as many lost poses as the longest outage of the run."""
+    fit: ChannelFit
+    """The uplink as fitted to the run."""
+    mean_square_growth: float
+    """Growth (logarithm, per step) of E[e^2] under the fitted channel."""
+    floquet: float | None
+    """Growth factor per step of a small error under the run's own sequence of losses; None where steps are missing."""
+    contraction: float | None
+    """The same about the motion that was driven, measured on the recorded poses."""
+    verdict: Verdict
 
     @property
     def n(self) -> int:
@@ -117,6 +128,14 @@ class Analysis:
             "bursts_verdict": self.bursts.verdict,
             "bursts_radius_lower": _finite(self.bursts.lower),
             "bursts_radius_upper": _finite(self.bursts.upper),
+            "channel_fit": _fit_to_json(self.fit),
+            "mean_square_stable": self.mean_square_growth < 0.0,
+            "mean_square_growth": _finite(self.mean_square_growth),
+            "floquet_multiplier_per_step": self.floquet,
+            "contraction_per_step": self.contraction,
+            "verdict": self.verdict.word,
+            "verdict_criterion": self.verdict.criterion,
+            "margin": self.verdict.margin,
             "disagreements": self.disagreements(),
         }
 
@@ -128,8 +147,11 @@ def _finite(value: float) -> float | None:
 
 def analyse(run: Run) -> Analysis:
     """Analysis of a run, recorded or simulated. Raises UserError if the run has no step."""
-    out = outages(run)
+    out, fit = outages(run), fit_channel(run.lost)
     v_r, w_r, gains = run.reference[:, 3], run.reference[:, 4], run.scenario.controller
+    growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain) / len(run)
+    of_drops, of_motion = _contractions(run)
+    n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts)
     return Analysis(
         run=run,
         outages=out,
@@ -137,7 +159,44 @@ def analyse(run: Run) -> Analysis:
         paper=paper_test(run),
         lifted_radius=lifted.largest_radius(out.n_ul_max, v_r, w_r, gains, run.ts),
         bursts=bursts.verdict(out.n_ul_max, v_r, w_r, gains, run.ts),
+        fit=fit,
+        mean_square_growth=growth,
+        floquet=of_drops,
+        contraction=of_motion,
+        verdict=judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run), gains.v_max),
     )
+
+
+def _burst_left(fit: ChannelFit, growth: float, v_r: Floats, w_r: Floats, run: Run) -> float | None:
+    """By what factor the mean burst may grow at the fitted loss rate; None for a fit without bursts."""
+    if fit.model != "gilbert_elliott" or growth >= 0.0 or fit.chain.loss_rate >= 1.0:
+        return None
+    critical = mean_square.critical_burst(fit.chain.loss_rate, v_r, w_r, run.scenario.controller, run.ts)
+    return critical / fit.mean_burst if np.isfinite(critical) else None
+
+
+def _contractions(run: Run) -> tuple[float | None, float | None]:
+    """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
+    first = int(np.argmin(run.lost))
+    steps = len(run) - first
+    if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
+        return None, None
+    lost, reference, gains = run.lost[first:], run.reference[first:], run.scenario.controller
+    with np.errstate(all="ignore"):
+        of_drops = floquet.drop_sequence(lost, reference[:, 3], reference[:, 4], gains, run.ts)
+        of_motion = floquet.trajectory(run.pose[first:], reference, lost, gains, run.ts)
+    return _finite(float(np.exp(of_drops[0] / steps))), _finite(float(np.exp(of_motion[0] / steps)))
+
+
+def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:
+    """The fitted channel with the names of the relay's parameters, each with its 95 % interval."""
+    estimates = {"loss_rate": fit.loss_rate, "p": fit.p, "r": fit.r}
+    return {
+        "model": fit.model,
+        "p_value": fit.p_value,
+        "mean_burst": _finite(fit.mean_burst),
+        **{name: None if e is None else [e.value, e.low, e.high] for name, e in estimates.items()},
+    }
 
 
 def paper_test(run: Run) -> PaperTest:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 from agv_analysis.analysis import Analysis
+from agv_analysis.channel_fit import Estimate
 
 
 def print_table(analysis: Analysis) -> None:
@@ -47,6 +49,7 @@ def _rows(analysis: Analysis) -> Iterator[tuple[str, str]]:
     yield "Overshoot", "no initial error" if found.overshoot is None else f"{found.overshoot:.2%}"
     yield "Damping of the speed", found.damping or "the run cannot tell"
     yield "Error", f"at most {found.position.peak:.3g} m, {found.position.final:.3g} m at the end"
+    yield "Fitted channel", _fit(analysis)
     yield (
         "Paper's test",
         _verdict(analysis.paper.stable, f"|lambda| at most {analysis.paper.radius:.6g}, at step {analysis.paper.k}"),
@@ -56,6 +59,33 @@ def _rows(analysis: Analysis) -> Iterator[tuple[str, str]]:
         _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
     )
     yield f"Any outages up to {analysis.n} slots", _bursts(analysis)
+    growth = math.exp(analysis.mean_square_growth)
+    yield "Mean square", _verdict(growth < 1.0, f"E\\[e^2] times {growth:.6g} a step under the fitted channel")
+    if analysis.floquet is not None and analysis.contraction is not None:
+        yield (
+            "These very losses",
+            _verdict(
+                analysis.floquet < 1.0,
+                f"times {analysis.floquet:.6g} a step about the reference, {analysis.contraction:.6g} about the motion",
+            ),
+        )
+    colour = {"asymptotic": "green", "mean-square": "green", "bounded": "yellow", "unstable": "red"}
+    verdict = analysis.verdict
+    yield "Verdict", f"[bold {colour[verdict.word]}]{verdict.word}[/] (by {verdict.criterion})"
+    yield "Margin", verdict.margin
+
+
+def _fit(analysis: Analysis) -> str:
+    fit = analysis.fit
+    if fit.model == "perfect":
+        return "perfect"
+    if fit.model == "bernoulli" or fit.p is None or fit.r is None:
+        return f"bernoulli, p {_interval(fit.loss_rate)}"
+    return f"gilbert_elliott, p {_interval(fit.p)}, r {_interval(fit.r)}"
+
+
+def _interval(estimate: Estimate) -> str:
+    return f"{estimate.value:.4f} ({estimate.low:.4f} .. {estimate.high:.4f})"
 
 
 def _verdict(stable: bool, why: str) -> str:

@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_analysis.cli import main
+from agv_analysis.confidence import clopper_pearson
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.sweep.collect import collect
@@ -25,7 +26,7 @@ from agv_analysis.sweep.execute import Results, on_dask, on_this_machine, run_pa
 from agv_analysis.sweep.picture import draw, margins
 from agv_analysis.sweep.plan import Part, Sweep, SweepError, parse_axis
 from agv_analysis.sweep.store import Store
-from agv_analysis.sweep.summary import clopper_pearson, quantiles, write_rows
+from agv_analysis.sweep.summary import quantiles, write_rows
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parent.parent / "config" / "paper.yaml")

@@ -1,0 +1,39 @@
+"""Confidence intervals of probabilities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+CONFIDENCE = 0.95
+
+
+def clopper_pearson(hits: int, trials: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Exact confidence interval of a probability after `hits` in `trials`.
+
+    Its ends are the probabilities under which as many hits, or as few, have probability (1 - confidence) / 2. Source:
+    Clopper and Pearson, Biometrika 26, 1934.
+    """
+    rest = (1.0 - confidence) / 2.0
+    low = 0.0 if hits == 0 else _crossing(lambda p: 1.0 - _at_most(hits - 1, trials, p) - rest)
+    high = 1.0 if hits == trials else _crossing(lambda p: rest - _at_most(hits, trials, p))
+    return low, high
+
+
+def _at_most(hits: int, trials: int, p: float) -> float:
+    """P(X <= hits) for X binomial, 0 < p < 1."""
+    k = np.arange(hits + 1)
+    ways = np.cumsum(np.log(np.concatenate(([1.0], (trials - k[:-1]) / k[1:]))))
+    return min(1.0, float(np.exp(ways + k * math.log(p) + (trials - k) * math.log1p(-p)).sum()))
+
+
+def _crossing(rising: Callable[[float], float]) -> float:
+    """Zero of a rising function on (0, 1), by bisection to the last bit."""
+    low, high = 0.0, 1.0
+    while True:
+        middle = 0.5 * (low + high)
+        if middle in (low, high):
+            return middle
+        low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)

@@ -1,0 +1,44 @@
+"""One word on a recorded loop: asymptotic, mean-square, bounded or unstable; what decided it, and what is left.
+
+The criteria are asked from the strongest statement to the weakest:
+
+- `asymptotic`: whatever outages no longer than the longest of the run come, the error dies out (bursts);
+- `mean-square`: under the channel fitted to the run, E[e^2] dies out, though some sequence of outages would not be
+  survived;
+- `bounded`: neither, but the speed is limited, which makes a bounded limit cycle of what would otherwise grow;
+- `unstable`: neither, and nothing bounds the error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The word, the criterion behind it, and the margin in words."""
+
+    word: str
+    criterion: str
+    margin: str
+
+
+def judge(n: int, n_bursts: int | None, mean_square_growth: float, burst_left: float | None, v_max: float) -> Verdict:
+    """Verdict on a run.
+
+    n: the longest outage seen [slots]; n_bursts: the longest that is proved to be survived in any order (None: all);
+    mean_square_growth: growth (logarithm, per step) of E[e^2] under the fitted channel; burst_left: by what factor its
+    mean burst may grow before that is positive (None: unknown or without bound); v_max: limit on the speed [m/s].
+    """
+    if n_bursts is None or n <= n_bursts:
+        left = "any number of" if n_bursts is None else str(n_bursts - n)
+        return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{'s' if left != '1' else ''}")
+    beyond = f"the longest outage exceeds what any sequence of outages may have by {n - n_bursts}"
+    if mean_square_growth < 0.0:
+        left = "" if burst_left is None else f"; outages may become {burst_left:.3g} times as long on average"
+        return Verdict(MEAN_SQUARE, "mean_square", beyond + left)
+    if v_max < float("inf"):
+        return Verdict(BOUNDED, "v_max", f"none: {beyond}; only the limit on the speed bounds the error")
+    return Verdict(UNSTABLE, "mean_square", f"none: {beyond}, and under the fitted channel the mean square grows")
