@@ -223,7 +223,9 @@ def _log_norms(maps: Floats, P: Floats) -> Floats:
     """Logarithm of the norm of each map, shape (N, m, m), in the vector norm sqrt(x' P x); shape (N,)."""
     root = np.linalg.cholesky(P).T
     inner = root @ maps @ np.linalg.inv(root)
-    return np.asarray(0.5 * np.log(_largest_eigenvalues(np.swapaxes(inner, 1, 2) @ inner)))
+    squares = np.maximum(_largest_eigenvalues(np.swapaxes(inner, 1, 2) @ inner), 0.0)
+    with np.errstate(divide="ignore"):  # a burst that leaves nothing of the error: -inf
+        return np.asarray(0.5 * np.log(squares))
 
 
 def _largest_eigenvalues(S: Floats) -> Floats:
