@@ -1,0 +1,211 @@
+"""Bursts in any order against explicit products of the steps' matrices, closed forms, and runs of the loop."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate
+from agv_analysis.stability.bursts import (
+    STABLE,
+    UNDECIDED,
+    UNSTABLE,
+    largest_n,
+    largest_n_across,
+    largest_n_along,
+    verdict,
+)
+from agv_analysis.stability.linearisation import step_matrices
+from agv_cloud.parameters import ControllerParameters
+from agv_cloud.reference import Reference
+
+CONFIG = str(Path(__file__).parents[1] / "config/paper.yaml")
+TS = 0.005
+Floats = NDArray[np.float64]
+
+
+def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
+    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
+
+
+def lap(track: str, steps: int = 20_000) -> tuple[Floats, Floats]:
+    setting = [f"error_detector.track={track}", f"error_detector.lap_time={steps * TS}"]
+    reference = Reference(load_scenario(CONFIG, setting).error_detector).first(steps)
+    return reference[:, 3], reference[:, 4]
+
+
+def constant(v: float, w: float) -> tuple[Floats, Floats]:
+    return np.full(5, v), np.full(5, w)
+
+
+def burst_map(F: Floats, G: Floats, first: int, length: int) -> Floats:
+    """Error after a burst, column by column: each step sees the error at `first`."""
+    held = error = np.eye(3)
+    for k in range(first, first + length):
+        error = F[k % len(F)] @ error + G[k % len(F)] @ held
+    return error
+
+
+# -- acceptance ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
+@pytest.mark.parametrize(("kx", "last"), [(5.0, 78), (25.0, 14), (250.0, 0)])
+def test_the_canonical_scenario_whatever_the_track(track: str, kx: float, last: int) -> None:
+    assert largest_n(*lap(track), gains(kx), TS) == (last, last + 1)
+
+
+def separation(track: str, kx: float, n: int, steps: int) -> float:
+    """Growth over a run of the distance between two runs under identical outages that begin a bit apart."""
+    setting = [f"error_detector.track={track}", f"controller.kx={kx}", f"plant.duration={steps * TS}"]
+    setting += ["relay.uplink.model=burst", f"relay.uplink.n={n}"]
+    one, other = (
+        simulate(load_scenario(CONFIG, [*setting, f"plant.initial_pose=[0.0, {y}, 1.5707963267948966]"]))
+        for y in (0.0, 1e-6)
+    )
+    assert len(one) == len(other) == steps
+    return float(np.linalg.norm(one.pose[-1] - other.pose[-1])) / 1e-6
+
+
+@pytest.mark.parametrize("track", ["paper", "line", "eight"])
+@pytest.mark.parametrize(("kx", "stable", "unstable"), [(5.0, 74, 90), (25.0, 14, 16), (250.0, 0, 1)])
+def test_runs_on_both_sides_of_the_border(track: str, kx: float, stable: int, unstable: int) -> None:
+    assert separation(track, kx, stable, 6000) < 1e-3
+    assert separation(track, kx, unstable, 4000) > 1e2
+
+
+# -- closed forms ----------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.floats(1e-3, 5.0))
+def test_along_the_track_every_factor_must_be_below_one(a: float) -> None:
+    last = next(n for n in itertools.count(-1) if not abs(1.0 - a * (n + 2)) < 1.0)
+    if abs(2.0 / a - round(2.0 / a)) > 1e-9:
+        assert largest_n_along(a) == last
+
+
+def test_the_marginal_burst_along_does_not_count() -> None:
+    assert [largest_n_along(a) for a in (2.0, 1.0, 0.5, 0.125)] == [-1, 0, 2, 14]
+    assert largest_n_along(0.0) is None
+
+
+@settings(deadline=None, derandomize=True, max_examples=50)
+@given(st.floats(0.5, 30.0), st.floats(0.05, 20.0), st.floats(0.05, 20.0))
+def test_across_the_track_by_eigenvalues(v: float, ky: float, ktheta: float) -> None:
+    F, G = step_matrices(np.array([v]), np.zeros(1), gains(25.0, ky, ktheta), TS)
+    found = largest_n_across(v, gains(25.0, ky, ktheta), TS)
+    assert found is not None
+
+    def radius(n: int) -> float:
+        return float(np.abs(np.linalg.eigvals(burst_map(F, G, 0, n + 1)[1:, 1:])).max())
+
+    for n in {0, found // 2, found} if found >= 0 else ():
+        assert radius(n) < 1.0 + 1e-7
+    assert radius(found + 1) > 1.0 - 1e-7
+
+
+def test_where_nothing_corrects_across() -> None:
+    assert largest_n_across(1.0, gains(25.0, 0.0, 2.0), TS) == -1
+    assert largest_n_across(1.0, gains(25.0, 1.0, 0.0), TS) == -1
+    assert largest_n_across(0.0, gains(), TS) == -1
+
+
+# -- bounds and certificate ------------------------------------------------------------------------------------------
+
+CASES = [(1.0, 0.0, 25.0, 1.0, 2.0, 12), (1.5, 0.6, 60.0, 4.0, 3.0, 4), (8.0, -2.0, 10.0, 2.0, 3.0, 6)]
+
+
+@pytest.mark.parametrize(("v", "w", "kx", "ky", "ktheta", "n"), CASES)
+def test_the_certificate_is_a_norm_that_every_burst_shrinks(
+    v: float, w: float, kx: float, ky: float, ktheta: float, n: int
+) -> None:
+    by, (v_r, w_r) = gains(kx, ky, ktheta), constant(v, w)
+    found = verdict(n, v_r, w_r, by, TS)
+    assert found.verdict == STABLE
+    P = found.certificate
+    assert P is not None
+    np.testing.assert_array_equal(P, P.T)
+    assert np.linalg.eigvalsh(P)[0] > 0.0
+    F, G = step_matrices(v_r, w_r, by, TS)
+    growth = []
+    for length in range(1, n + 2):
+        M = burst_map(F, G, 0, length)
+        assert np.linalg.eigvalsh(M.T @ P @ M - P)[-1] < 0.0
+        worst = np.max(np.linalg.eigvals(np.linalg.solve(P, M.T @ P @ M)).real)
+        growth.append(math.sqrt(worst) ** (1.0 / length))
+    assert found.upper == pytest.approx(max(growth), rel=1e-9)
+
+
+@pytest.mark.parametrize(("v", "w", "kx", "ky", "ktheta", "n"), CASES)
+def test_no_sequence_leaves_the_bounds(v: float, w: float, kx: float, ky: float, ktheta: float, n: int) -> None:
+    """All products of up to four bursts of five lengths: their radius per step is below the upper bound."""
+    by, (v_r, w_r) = gains(kx, ky, ktheta), constant(v, w)
+    found, (F, G) = verdict(n, v_r, w_r, by, TS), step_matrices(v_r, w_r, by, TS)
+    lengths = sorted({1, 2, (n + 1) // 2, n, n + 1})
+    maps = {length: burst_map(F, G, 0, length) for length in lengths}
+    radii = {}
+    for count in range(1, 5):
+        for sequence in itertools.product(lengths, repeat=count):
+            M = np.linalg.multi_dot([np.eye(3), *(maps[length] for length in sequence), np.eye(3)])
+            radii[sequence] = float(np.abs(np.linalg.eigvals(M)).max()) ** (1.0 / sum(sequence))
+    assert max(radii.values()) <= found.upper + 1e-9
+    repeated = {length: radii[(length,)] for length in lengths}
+    assert found.lower >= max(repeated.values()) - 1e-7
+    assert found.lower == pytest.approx(
+        float(np.abs(np.linalg.eigvals(burst_map(F, G, 0, found.worst + 1))).max()) ** (1.0 / (found.worst + 1)),
+        abs=1e-7,
+    )
+
+
+def test_speeds_that_change_inside_a_burst() -> None:
+    """A lap of 60 steps with stops: random sequences of bursts, driven by hand, stay below the upper bound."""
+    v_r, w_r = lap("warehouse", 60)
+    v_r = 10.0 * v_r
+    by, n = gains(20.0, 1.0, 2.0), 8
+    found, (F, G) = verdict(n, v_r, w_r, by, TS), step_matrices(v_r, w_r, by, TS)
+    assert found.verdict in (STABLE, UNDECIDED)
+    random = np.random.default_rng(1)
+    for _ in range(40):
+        product, k, log_scale = np.eye(3), 0, 0.0
+        while k < 6000:
+            length = int(random.integers(1, n + 2))
+            product, k = burst_map(F, G, k, length) @ product, k + length
+            size = np.abs(product).max()
+            product, log_scale = product / size, log_scale + math.log(size)
+        assert math.exp(log_scale / k) <= found.upper + 2e-3
+
+
+@pytest.mark.parametrize("n", [16, 20])
+def test_an_unstable_verdict_names_a_burst_that_grows(n: int) -> None:
+    found = verdict(n, *constant(1.0, 0.0), gains(), TS)
+    assert (found.verdict, found.worst, found.certificate) == (UNSTABLE, n, None)
+    assert found.lower == pytest.approx(abs(1.0 - 0.125 * (n + 1)) ** (1.0 / (n + 1)), rel=1e-12)
+
+
+def test_a_parked_agv_is_judged_by_what_it_can_reach() -> None:
+    stopped = np.zeros(10)
+    assert largest_n(stopped, stopped, gains(), TS) == (14, 15)
+    assert verdict(14, stopped, stopped, gains(), TS).certificate is not None
+
+
+def test_bursts_that_bring_the_error_to_nothing() -> None:
+    """1 / a is an integer: for a parked AGV M_8 = 0 at a = 1/8, and M_1 = 0 at a = 1."""
+    stopped = np.zeros(10)
+    assert verdict(7, stopped, stopped, gains(), TS).verdict == STABLE
+    found = verdict(0, stopped, stopped, gains(200.0), TS)
+    assert (found.verdict, found.lower, found.upper) == (STABLE, 0.0, 0.0)
+
+
+def test_degenerate_gains() -> None:
+    assert largest_n(*lap("line"), gains(0.0), TS)[0] == -1  # what is off along the track stays off
+    assert largest_n(*lap("line"), gains(200.0), TS) == (0, 1)  # deadbeat
+    assert largest_n(*lap("line"), gains(401.0), TS) == (-1, 0)
