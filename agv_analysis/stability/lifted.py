@@ -41,16 +41,24 @@ def spectral_radius(n: int, v_r: float, w_r: float, gains: ControllerParameters,
 
 def spectral_radii(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> Floats:
     """As `spectral_radius` for speeds of shape (N,), shape (N,)."""
-    loop = _Loop.at(v_r, w_r, gains, ts)
-    starts = _starts(n, loop)
+    a = np.full(len(v_r), ts * gains.kx)
+    b, c = ts * gains.ktheta * v_r, ts * ts * gains.ky * v_r * v_r
+    return radii_of(np.full(len(v_r), float(n)), a, b, c, ts * w_r, v_r == 0.0)
+
+
+def radii_of(n: Floats, a: Floats, b: Floats, c: Floats, phi: Floats, parked: NDArray[np.bool_]) -> Floats:
+    """As `spectral_radius` for loops each of its own, by the numbers that D is made of; all of shape (N,)."""
+    loop = _Loop.of(n, a, b, c, phi, parked)
+    starts = _starts(loop)
     spread = _Loop(*(np.broadcast_to(values, starts.shape).ravel() for values in loop))
-    sigma = _newton(n, starts.ravel(), spread).reshape(starts.shape)
+    sigma = _newton(starts.ravel(), spread).reshape(starts.shape)
     return np.asarray(np.nanmax(np.abs(1.0 + sigma), axis=0, initial=0.0))
 
 
 class _Loop(NamedTuple):
     """What D depends on, all of the same shape; cos1 = cos phi - 1, sin2 = sin^2 phi."""
 
+    n: Floats
     a: Floats
     b: Floats
     c: Floats
@@ -61,21 +69,19 @@ class _Loop(NamedTuple):
     """How many multipliers are 1 whatever the gains."""
 
     @classmethod
-    def at(cls, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> _Loop:
-        a, b = np.full(len(v_r), ts * gains.kx), ts * gains.ktheta * v_r
-        c, phi = ts * ts * gains.ky * v_r * v_r, ts * w_r
+    def of(cls, n: Floats, a: Floats, b: Floats, c: Floats, phi: Floats, parked: NDArray[np.bool_]) -> _Loop:
         sin2 = np.sin(phi) ** 2
-        neutral = np.where(v_r != 0.0, 0.0, np.where(sin2 != 0.0, 1.0, 2.0))
-        return cls(a, b, c, phi, -2.0 * np.sin(0.5 * phi) ** 2, sin2, neutral)
+        neutral = np.where(parked, np.where(sin2 != 0.0, 1.0, 2.0), 0.0)
+        return cls(n, a, b, c, phi, -2.0 * np.sin(0.5 * phi) ** 2, sin2, neutral)
 
 
-def _newton(n: int, starts: Complexes, loop: _Loop) -> Complexes:
+def _newton(starts: Complexes, loop: _Loop) -> Complexes:
     """A root sigma of D for each start, without the neutral ones; NaN where none was found. All of shape (M,)."""
     found = np.full(starts.shape, np.nan, dtype=np.complex128)
     index, sigma = np.arange(len(starts)), starts
     with np.errstate(all="ignore"):
         for _ in range(_ITERATIONS):
-            value, slope = _characteristic(n, sigma, loop)
+            value, slope = _characteristic(sigma, loop)
             # Newton's step on D / sigma^neutral, whose roots are those of D without the neutral ones.
             step = np.where(value == 0.0, 0.0, value / (slope - loop.neutral * value / sigma))
             sigma = sigma - step
@@ -89,9 +95,9 @@ def _newton(n: int, starts: Complexes, loop: _Loop) -> Complexes:
     return found
 
 
-def _characteristic(n: int, sigma: Complexes, loop: _Loop) -> tuple[Complexes, Complexes]:
+def _characteristic(sigma: Complexes, loop: _Loop) -> tuple[Complexes, Complexes]:
     """D and dD/dz at z = 1 + sigma."""
-    a, b, c, _, cos1, sin2, _ = loop
+    n, a, b, c, _, cos1, sin2, _ = loop
     z, cos = 1.0 + sigma, 1.0 + cos1
     u = np.exp(-n * np.log1p(sigma))
     du = -n * u / z
@@ -104,9 +110,9 @@ def _characteristic(n: int, sigma: Complexes, loop: _Loop) -> tuple[Complexes, C
     return value, slope
 
 
-def _starts(n: int, loop: _Loop) -> Complexes:
+def _starts(loop: _Loop) -> Complexes:
     """Where Newton's method starts, shape (starts, N): on the branches of each family, and near its slow real roots."""
-    a, b, c, phi = loop.a, loop.b, loop.c, loop.phi
+    n, a, b, c, phi = loop.n, loop.a, loop.b, loop.c, loop.phi
     turn = np.exp(1j * phi)
     with np.errstate(all="ignore"):
         starts = []
@@ -120,7 +126,7 @@ def _starts(n: int, loop: _Loop) -> Complexes:
         p, q = b - n * c, 1.0 - n * b
         root = np.sqrt(p * p - 4.0 * q * c + 0j)
         starts += [-2.0 * c / (p + root), -2.0 * c / (p - root), (-p - root) / (2.0 * q)]
-        value, slope = _characteristic(n, np.zeros(len(a), dtype=np.complex128), loop)
+        value, slope = _characteristic(np.zeros(len(a), dtype=np.complex128), loop)
         starts.append(-value / slope)
         # A fast turn mixes along and across; then the slow roots are near exp(i phi).
         starts += [turn * np.exp(1j * angle / (n + 1.0)) - 1.0 for angle in (-2.0, -0.7, 0.0, 0.7, 2.0)]
