@@ -1,12 +1,11 @@
 # Everything happens in .venv, which is made when it is first needed. Where a ROS 2 installation is sourced, its rclpy is
-# used; elsewhere rclpy comes from PyPI.
+# used, and the system's numpy, against which its messages were built; elsewhere rclpy comes from PyPI.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := bags/demo
 
 HAVE_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
-EXTRA_ROS := $(if $(HAVE_ROS),,ros)
 comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
@@ -38,12 +37,12 @@ clean:
 	rm -rf $(VENV) $(DEMO) build install log *.egg-info
 
 $(VENV)/bin/python:
-	$(PYTHON) -m venv $(VENV)
+	$(PYTHON) -m venv $(if $(HAVE_ROS),--system-site-packages) $(VENV)
 
 $(VENV)/run.stamp: $(VENV)/bin/python setup.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$(EXTRA_ROS)]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(if $(HAVE_ROS),,[ros])'
 	touch $@
 
 $(VENV)/test.stamp: $(VENV)/bin/python setup.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test$(if $(EXTRA_ROS),$(comma)ros)]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test$(if $(HAVE_ROS),,$(comma)ros)]'
 	touch $@ $(VENV)/run.stamp
