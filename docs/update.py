@@ -30,6 +30,20 @@ def parameters_page() -> str:
     )
 
 
+def paper_page(out: str) -> str:
+    """docs/paper.md; the paper is reproduced in the directory `out`."""
+    command("reproduce", "--out", out)
+    return (
+        "# The paper's claims\n\nMade by `agv-ncs reproduce`, which also draws the paper's figures. Every value is "
+        "measured when the command runs, on the scenario of `config/paper.yaml` with the settings that the claim "
+        "names; with `--ros` on recorded runs of the nodes. What no single run shows (twins, a pose that is always n "
+        "steps old, scans of a gain) is simulated either way. The paper's text gives neither its track nor K_y and "
+        "K_theta: the scenario is a choice.\n\nThe error is `y_r - y_c`, settled when it stays below 1 cm. Twins are "
+        "two AGVs that begin a micrometre apart and meet the same losses; their number is their distance at the end as "
+        "a multiple of that at the beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8")
+    )
+
+
 def demo_block(analysed: str) -> str:
     """The part of README.md that shows what the demo prints, from what `analyse` printed; paths are the demo's."""
     table = "\n".join(line.rstrip() for line in re.split(r"\nbag: ", analysed)[0].splitlines())
@@ -48,6 +62,8 @@ def main() -> None:
         bag = str(Path(folder) / "bag")
         command("run", "config/outages.yaml", "--bag", bag)
         analysed = command("analyse", bag, "--picture", "docs/images/demo.png")
+    with tempfile.TemporaryDirectory() as folder:
+        (REPOSITORY / "docs/paper.md").write_text(paper_page(folder), encoding="utf-8")
     (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
     (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")
 

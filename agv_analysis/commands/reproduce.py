@@ -1,0 +1,58 @@
+"""`agv-ncs reproduce`: the paper in one command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from agv_analysis.reproduce.runs import Runs
+
+
+@click.command("reproduce")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("paper"), show_default=True,
+    help="Directory for figures, their data and the tables.",
+)  # fmt: skip
+@click.option("--ros", is_flag=True, help="Measure on recorded runs of the nodes instead of simulated ones.")
+def command(out: Path, ros: bool) -> None:
+    """Reproduce the paper: its figures, and every claim of its text with what was measured.
+
+    \b
+    Examples:
+      agv-ncs reproduce
+      agv-ncs reproduce --out paper_on_dds --ros
+    """
+    from agv_analysis.reproduce import report
+    from agv_analysis.reproduce.claim import check
+    from agv_analysis.reproduce.claims import CLAIMS
+    from agv_analysis.reproduce.figures import figures, write
+    from agv_ros.errors import UserError
+
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: cannot be made: {error.strerror}") from None
+    runs = _runs(out, ros)
+    for figure in figures(runs):
+        write(figure, out)
+    findings = [check(claim, runs) for claim in CLAIMS]
+    report.print_claims(findings)
+    report.write(findings, [], "recorded runs" if ros else "simulation", out)
+    click.echo(f"figures and tables: {out}")
+
+
+def _runs(out: Path, ros: bool) -> Runs:
+    from agv_analysis.reproduce.runs import recorded, simulated
+
+    if not ros:
+        return simulated()
+    try:
+        return recorded(out / "bags")
+    except ImportError as error:
+        raise click.ClickException(
+            f"the loop runs on ROS 2, which is not to be found here ({error}): source your ROS 2 installation, "
+            "or `pip install 'agv_ncs[ros]'`"
+        ) from None

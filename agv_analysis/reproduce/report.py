@@ -1,0 +1,141 @@
+"""The results as tables: on the terminal, as Markdown, as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Finding, Values
+from agv_analysis.version import version
+from agv_ros.errors import UserError
+
+_ROUNDING = 1e-9
+"""Below this a measured value differs between machines."""
+
+_COLOURS = {HOLDS: "green", REMARK: "yellow", FAILS: "red"}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A result of the future work: rows of equal names."""
+
+    key: str
+    title: str
+    rows: Sequence[Values]
+
+
+def text_of(value: Any) -> str:
+    """A measured value for people: four digits, 0 for what is rounding, `never` for what did not happen."""
+    if value is None:
+        return "never"
+    if not isinstance(value, float):
+        return str(value)
+    return "0" if abs(value) < _ROUNDING else f"{value:.4g}"
+
+
+def measured_text(values: Values) -> str:
+    """Measured values on one line."""
+    return "; ".join(f"{name}: {text_of(value)}" for name, value in values.items())
+
+
+def print_claims(findings: Sequence[Finding]) -> None:
+    """Print the claims, each with what was measured and the verdict."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table as Grid
+
+    grid = Grid(show_lines=True)
+    for name in ("Paper", "Claim", "Measured", "Verdict"):
+        grid.add_column(name)
+    for finding in findings:
+        judgement = finding.judgement
+        remark = f"\n{escape(judgement.remark)}" if judgement.remark else ""
+        verdict = f"[{_COLOURS[judgement.verdict]}]{judgement.verdict}[/]{remark}"
+        cells = (finding.claim.where, finding.claim.text, measured_text(finding.measured))
+        grid.add_row(*map(escape, cells), verdict)
+    Console(highlight=False).print(grid)
+
+
+def print_table(table: Table) -> None:
+    """Print a table of the future work."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table as Grid
+
+    grid = Grid(title=escape(table.title), title_justify="left")
+    for name in table.rows[0]:
+        grid.add_column(escape(name), justify="right")
+    for row in table.rows:
+        grid.add_row(*(escape(text_of(value)) for value in row.values()))
+    Console(highlight=False).print(grid)
+
+
+def claims_markdown(findings: Sequence[Finding]) -> str:
+    """The claims as a table in Markdown."""
+    rows: list[Values] = [
+        {
+            "paper": finding.claim.where,
+            "claim": finding.claim.text,
+            "measured": measured_text(finding.measured),
+            "verdict": finding.judgement.verdict,
+            "remark": finding.judgement.remark,
+        }
+        for finding in findings
+    ]
+    return _markdown(rows)
+
+
+def table_markdown(table: Table) -> str:
+    """A table of the future work in Markdown, under its title."""
+    return f"### {table.title}\n\n{_markdown(table.rows)}"
+
+
+def _markdown(rows: Sequence[Values]) -> str:
+    lines = [list(rows[0]), ["---"] * len(rows[0]), *([text_of(value) for value in row.values()] for row in rows)]
+    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+
+
+def write(findings: Sequence[Finding], tables: Sequence[Table], source: str, folder: Path) -> None:
+    """Write claims.md, future.md and claims.json, which holds both, to `folder`.
+
+    Raises UserError if that cannot be written to.
+    """
+    try:
+        (folder / "claims.md").write_text(claims_markdown(findings), encoding="utf-8")
+        (folder / "future.md").write_text("\n".join(map(table_markdown, tables)), encoding="utf-8")
+        text = json.dumps(to_json(findings, tables, source), indent=2, allow_nan=False)
+        (folder / "claims.json").write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written to: {error.strerror}") from None
+
+
+def to_json(findings: Sequence[Finding], tables: Sequence[Table], source: str) -> dict[str, Any]:
+    """The results by name; null: it did not happen, or the number is infinite."""
+    claims = [
+        {
+            "key": finding.claim.key,
+            "where": finding.claim.where,
+            "claim": finding.claim.text,
+            "measured": _finite(finding.measured),
+            "verdict": finding.judgement.verdict,
+            "remark": finding.judgement.remark,
+        }
+        for finding in findings
+    ]
+    return {
+        "version": version(),
+        "source": source,
+        "claims": claims,
+        "future_work": {table.key: [_finite(row) for row in table.rows] for table in tables},
+    }
+
+
+def _finite(values: Values) -> Values:
+    """JSON has no infinity."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
+    }
