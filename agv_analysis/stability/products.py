@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 
@@ -35,28 +36,23 @@ def log_spectral_radius(factors: Floats) -> float:
     return log_scale + float(np.log(radius)) if radius > 0.0 else -np.inf
 
 
-def growths(factors: Floats, passes: int = 8) -> Floats:
-    """Logarithms of the moduli of the eigenvalues of a product, largest first, shape (m,); `factors` as above.
+def growths(factors: Floats) -> Floats:
+    """Logarithms of the moduli of all eigenvalues of a product, largest first, shape (m,); `factors` as above.
 
-    Also of those that the product itself would lose to rounding, by orthogonalisation after each factor, `passes` times
-    around (Benettin et al., Meccanica 15, 1980). The largest, and the second if these two are a complex pair, are
-    exact; the others are those of directions that have had `passes` rounds to align. -inf for what is annihilated.
+    Also of those that the product itself would lose to rounding: the matrix of all minors of order i (i-th compound) of
+    a product is the product of those of its factors, and its largest eigenvalue is the product of the i largest (Horn
+    and Johnson, Matrix Analysis, 2nd ed., 0.8.1). -inf for what is annihilated.
     """
-    basis = np.eye(factors.shape[-1])
-    orthogonalised_pass(factors, basis)  # aligns the directions
-    logs = sum((orthogonalised_pass(factors, basis) for _ in range(passes)), np.zeros(len(basis)))
-    found = np.sort(logs / passes)[::-1]
-    product, log_scale = ordered_product(factors)
-    values = np.linalg.eigvals(product)
-    largest = values[np.abs(values).argmax()]
-    if largest == 0.0:
-        return found
-    volume, found[0] = found.sum(), log_scale + math.log(abs(largest))
-    if abs(largest.imag) > 1e-9 * abs(largest):
-        found[1] = found[0]
-        if len(found) == 3:
-            found[2] = volume - 2.0 * found[0]
-    return found
+    of_largest = [log_spectral_radius(_minors(factors, order)) for order in range(1, factors.shape[-1] + 1)]
+    with np.errstate(invalid="ignore"):
+        found = np.diff(of_largest, prepend=0.0)
+    return np.where(np.isnan(found), -np.inf, found)
+
+
+def _minors(factors: Floats, order: int) -> Floats:
+    """Compound matrices of factors of shape (N, m, m): shape (N, c, c), c = m over `order`."""
+    chosen = np.array(list(combinations(range(factors.shape[-1]), order)))
+    return np.asarray(np.linalg.det(factors[:, chosen[:, None, :, None], chosen[None, :, None, :]]))
 
 
 def orthogonalised_pass(factors: Floats, basis: Floats) -> Floats:
