@@ -11,19 +11,37 @@ import click
 from agv_analysis.commands import with_settings, write_json
 
 if TYPE_CHECKING:
+    from agv_analysis.scenario import Scenario
     from agv_analysis.stability.margins import Margins
 
 
 @click.command("stability")
 @with_settings
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
-def command(params: str, settings: tuple[str, ...], json_file: Path | None) -> None:
+@click.option(
+    "--map", "axes", metavar="AXIS,AXIS",
+    help="Instead: margins over a grid of two of kx, ky, ktheta, ts, v and curvature, each from a tenth to ten times "
+    "the scenario's value.",
+)  # fmt: skip
+@click.option("--points", type=click.IntRange(2, 1000), default=100, show_default=True, help="Points of each axis.")
+@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Where the map goes, map.csv by default.")
+@click.option("--picture", type=click.Path(path_type=Path), help="Where the map is drawn, map.png by default.")
+def command(
+    params: str,
+    settings: tuple[str, ...],
+    json_file: Path | None,
+    axes: str | None,
+    points: int,
+    csv_file: Path | None,
+    picture: Path | None,
+) -> None:
     """Say how much the loop of the params file PARAMS can take, by each criterion, and where they disagree.
 
     \b
     Examples:
       agv-ncs stability config/paper.yaml
       agv-ncs stability config/outages.yaml --set controller.kx=5.0 --set error_detector.track=line --json margins.json
+      agv-ncs stability config/paper.yaml --map kx,ts --csv map.csv --picture map.png
     """
     from rich.console import Console
     from rich.table import Table
@@ -32,6 +50,9 @@ def command(params: str, settings: tuple[str, ...], json_file: Path | None) -> N
     from agv_analysis.stability.margins import margins
 
     scenario = load_scenario(params, settings)
+    if axes is not None:
+        _map(scenario, axes, points, csv_file or Path("map.csv"), picture or Path("map.png"))
+        return
     console = Console(highlight=False)
     with Console(stderr=True).status("computing the margins ..."):
         found = margins(scenario)
@@ -41,10 +62,37 @@ def command(params: str, settings: tuple[str, ...], json_file: Path | None) -> N
     for name, value in _rows(found, scenario.plant.ts):
         table.add_row(name, value)
     console.print(table)
+    best = _best_gains(scenario)
+    for objective, kx in best.items():
+        console.print(f"Best K_x, {objective.replace('_', ' ')}: {kx:.4g} 1/s")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     if json_file is not None:
-        write_json(json_file, found.to_json())
+        write_json(json_file, {**found.to_json(), "best_kx": best or None})
+
+
+def _best_gains(scenario: Scenario) -> dict[str, float]:
+    """Best K_x by objective under the scenario's uplink; empty for a channel that is no Markov chain or loses all."""
+    from agv_analysis.stability.chain import chain_of
+    from agv_analysis.stability.gains import best_kx
+
+    chain = chain_of(scenario.relay.uplink)
+    return best_kx(chain, scenario.plant.ts) if chain is not None and chain.loss_rate < 1.0 else {}
+
+
+def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:
+    """Write and draw the map over two axes."""
+    from agv_analysis.stability.margin_map import around, draw, margin_map, write_csv
+    from agv_ros.errors import UserError
+
+    names = tuple(axes.split(","))
+    if len(names) != 2:
+        raise UserError(f"--map takes two axes with a comma between them, as in kx,ts; got {axes!r}")
+    base, (first, second) = around(scenario, names, points)
+    found = margin_map(base, (names[0], names[1]), first, second)
+    write_csv(csv_file, found)
+    draw(picture, found)
+    click.echo(f"map:     {csv_file}\npicture: {picture}")
 
 
 def _rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:

@@ -1,1 +1,19 @@
-"""Is the loop stable under outages?"""
+"""Is the loop stable under outages? Five answers, one module each, because they answer different questions.
+
+    paper        |lambda| < 1 for A(k) at every step: blind to outages on a straight track
+    lifted       the pose is n steps old at every step, speeds frozen: a delay; over a lap that turns: `floquet`
+    bursts       up to n losses in a row, in any order, for ever: a joint spectral radius, bounded from both sides
+    mean_square  random losses, E[|e|^2] dies out: a Markov jump linear system; `almost_sure`: almost every run does
+    floquet      one lap, or one recorded sequence of losses, again and again: what that very lap does
+
+The empirical answer, twins that start apart and meet the same losses, is `agv_analysis.simulation`'s
+(`simulate_batch(..., twins=True)`). All but the paper's start from `linearisation`: e(k+1) = F(k) e(k) + G(k) e(k-n).
+
+What counts as stable is the same everywhere: a small error dies out over the lap. A parked AGV cannot move sideways or
+turn, so the error across the track is neutral while it stands. Criteria at frozen speeds therefore leave neutral
+multipliers out, criteria over a lap let the lap as a whole decide, and on a track that never moves only the errors that
+the commands can reach are judged. An error that neither grows nor dies out is not stable.
+
+`margins` puts the numbers side by side, `margin_map` spreads them over two parameters, `gains` finds the best K_x, and
+`verdict` has one word for a run.
+"""
