@@ -129,16 +129,19 @@ def _on_a_straight_track(point: Point) -> int:
 
 
 def _on_curves(guess: Ints, *numbers: NDArray[Any]) -> Ints:
-    """By doubling from beyond what a straight track allows, then bisection, of all points at once."""
+    """By doubling from what a straight track allows, which is nearly right, then bisection, of all points at once."""
 
     def are_stable(n: Ints, at: Ints) -> NDArray[np.bool_]:
         return np.asarray(radii_of(n[at].astype(np.float64), *(values[at] for values in numbers)) < 1.0 - 1e-12)
 
-    low, high = np.full_like(guess, -1), 2 * np.maximum(guess, 0) + 4
+    low, high = np.full_like(guess, -1), guess + 1
     going = np.arange(len(guess))
     while len(going):
         going = going[are_stable(high, going) & (high[going] < LIMIT)]
-        low[going], high[going] = high[going], np.minimum(2 * high[going], LIMIT)
+        low[going], high[going] = high[going], np.minimum(2 * high[going] + 1, LIMIT)
+    going = np.flatnonzero((guess >= 0) & (low < guess))
+    stable = are_stable(guess, going)
+    low[going[stable]], high[going[~stable]] = guess[going[stable]], guess[going[~stable]]
     while len(going := np.flatnonzero(high - low > 1)):
         middle = (low + high) // 2
         stable = are_stable(middle, going)
