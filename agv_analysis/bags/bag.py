@@ -20,6 +20,9 @@ from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import Storage
 from agv_analysis.bags.table import Table
 
+_LARGE = 2**24
+"""Files of more bytes than this are decoded by compiled code."""
+
 Progress = Callable[[int], None]
 """Called with the share of a bag that has been read [%], every now and then."""
 
@@ -159,7 +162,7 @@ class _Reading:
                 raise UndecodableError(f"it has messages of two types, {first.name} and {schema.name}")
             if topic not in self._tables:
                 kind = parse_schema(schema.name, schema.encoding, schema.text)
-                self._tables[topic] = Table(kind, storage.expected(channel.id))
+                self._tables[topic] = Table(kind, storage.expected(channel.id), storage.size > _LARGE)
         except UndecodableError as error:
             self._refuse(topic, error)
         return self._tables.get(topic)

@@ -30,6 +30,11 @@ class Batch:
     def __len__(self) -> int:
         return len(self.starts)
 
+    def after(self, first: int, count: int | None = None) -> Batch:
+        """The messages from `first` on, `count` at most."""
+        part = slice(first, None if count is None else first + count)
+        return Batch(self.buffer, self.starts[part], self.sizes[part])
+
     @property
     def log_times(self) -> Ints:
         """[ns], shape (n,)."""

@@ -41,7 +41,8 @@ class Definition(NamedTuple):
 class Content(NamedTuple):
     """What is in a chunk."""
 
-    messages: Messages
+    messages: dict[int, Messages]
+    """By channel."""
     definitions: list[Definition]
     lost: int
     """Bytes that are no whole record."""
@@ -157,7 +158,7 @@ def find(content: bytes, index: list[Ints]) -> Content | None:
         if found is None:
             return None
         definitions += found
-    return Content(messages, definitions, 0)
+    return Content(by_channel(messages), definitions, 0)
 
 
 def _definitions(content: bytes, position: int, end: int) -> list[Definition] | None:
@@ -197,7 +198,8 @@ def walk(content: bytes, is_cut: bool = False) -> Content:
             position = starts.pop()
         lost += after - position
         position = after
-    return Content(messages_at(np.frombuffer(content, np.uint8), np.array(starts, np.int64)), definitions, lost)
+    messages = messages_at(np.frombuffer(content, np.uint8), np.array(starts, np.int64))
+    return Content(by_channel(messages), definitions, lost)
 
 
 def run_of_messages(content: bytes, position: int) -> tuple[list[int], int]:
@@ -270,13 +272,14 @@ def messages_at(buffer: Bytes, starts: Ints) -> Messages:
     return Messages(starts, lengths, numbers_at(buffer, starts + RECORD.size, "<u2"))
 
 
-def by_channel(messages: Messages) -> Iterator[tuple[int, Messages]]:
+def by_channel(messages: Messages) -> dict[int, Messages]:
     """The messages of each channel."""
     order = np.argsort(messages.channels, kind="stable")
     channels = messages.channels[order]
     starts, lengths = messages.starts[order], messages.lengths[order]
     bounds = [0, *(np.flatnonzero(channels[1:] != channels[:-1]) + 1).tolist(), len(channels)]
-    for begin, end in pairwise(bounds):
-        if end > begin:
-            mine = slice(begin, end)
-            yield int(channels[begin]), Messages(starts[mine], lengths[mine], channels[mine])
+    return {
+        int(channels[begin]): Messages(starts[begin:end], lengths[begin:end], channels[begin:end])
+        for begin, end in pairwise(bounds)
+        if end > begin
+    }

@@ -173,7 +173,8 @@ class McapFile:
                 if not self._is_proven:
                     self.findings.add("message outside of chunks, which no CRC covers", len(item.starts))
                 buffer = np.frombuffer(item.content, np.uint8)
-                yield from self._split(buffer, messages_at(buffer, np.array(item.starts, np.int64)), is_wanted)
+                messages = messages_at(buffer, np.array(item.starts, np.int64))
+                yield from self._split(buffer, by_channel(messages), is_wanted)
             elif isinstance(item, _Cut):
                 yield from self._content(item.position, item.content, walk(item.content, is_cut=True), False, is_wanted)
             elif opened is not None:
@@ -417,8 +418,10 @@ class McapFile:
             self._define(definition, is_proven)
         yield from self._split(np.frombuffer(content, np.uint8), found.messages, is_wanted)
 
-    def _split(self, buffer: Bytes, messages: Messages, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
-        for number, mine in by_channel(messages):
+    def _split(
+        self, buffer: Bytes, messages: dict[int, Messages], is_wanted: IsWanted
+    ) -> Iterator[tuple[Channel, Batch]]:
+        for number, mine in messages.items():
             channel = self.channels.get(number)
             if channel is None:
                 what = f"message of channel {number}, which is not described, left out"

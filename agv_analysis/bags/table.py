@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Batch, Bytes, Group, Ints, Layouts, values_at
 from agv_analysis.bags.errors import UndecodableError
+from agv_analysis.bags.express import MAX_LAYOUTS, Run, compiled_place, recipes
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
 from agv_analysis.bags.schema import STRING, Struct
 
@@ -71,34 +72,25 @@ def _columns(kind: Struct, prefix: str = "", dims: tuple[int, ...] = ()) -> Iter
             yield path, _Column("S" if member.element == STRING else member.element, list(inner))
 
 
-class _Run(NamedTuple):
-    """Bytes that lie side by side in the message and, just so, in the row."""
-
-    source: int
-    target: int
-    size: int
-
-    def is_before(self, other: _Run) -> bool:
-        """Does the other follow without a gap, in the message as in the row?"""
-        return self.source + self.size == other.source and self.target + self.size == other.target
-
-
 class Table:
     """Columns of a topic: `log_time_ns`, `publish_time_ns`, and one for each value of its type."""
 
-    def __init__(self, kind: Struct, expected: int = 0) -> None:
-        """`expected`: messages to make room for; more may come."""
+    def __init__(self, kind: Struct, expected: int = 0, is_large: bool = False) -> None:
+        """`expected`: messages to make room for; more may come. `is_large`: so many that compiled code pays."""
         self._columns = {LOG_TIME: _Column("i8", []), PUBLISH_TIME: _Column("i8", []), **dict(_columns(kind))}
         self._ragged = kind.has_sequences
         self._expected = expected
         self._fitted: set[int] = set()
-        self._plans: dict[int, tuple[list[_Run], list[Leaf]]] = {}
+        self._plans: dict[int, tuple[list[Run], list[Leaf]]] = {}
         self._dtype = self._make_dtype()
         self._store = np.empty(0, np.uint8)
         self._capacity = 0
         self._count = 0
         self._message_bytes = 0
         self.layouts = Layouts(kind)
+        self._place = compiled_place() if is_large and not self._ragged else None
+        self._recipes = recipes([])
+        self._express: dict[tuple[int, int], tuple[int, Layout]] = {}
 
     @property
     def rows(self) -> NDArray[np.void]:
@@ -112,25 +104,55 @@ class Table:
         Raises UndecodableError if none of the topic's messages is of its type, or if the array would grow out of all
         proportion to its messages.
         """
-        groups = self.layouts.split(batch)
         self._message_bytes += int(batch.sizes.sum())
+        done = 0
+        while self._place is not None and done < len(batch):
+            rest = batch.after(done)
+            self._make_room(len(rest))
+            placed = self._place(
+                rest.buffer, rest.starts, rest.sizes, *self._recipes, self._store, self._dtype.itemsize, self._count
+            )
+            self._count += placed
+            done += placed
+            if done < len(batch):  # one of a layout that is not known yet
+                self._append(batch.after(done, 1))
+                done += 1
+        if done < len(batch):
+            self._append(batch.after(done))
+
+    def _append(self, batch: Batch) -> None:
+        """Take a batch, layout by layout."""
+        groups = self.layouts.split(batch)
         for group in groups:
             self._widen(group.layout)
         first, number = self._count, sum(len(group.places) for group in groups)
         if first + number == 0 and self.layouts.misfits >= _MISFITS_BELIEVED:
             raise UndecodableError(f"its messages are not of its type: {self.layouts.first_misfit}")
-        if first + number > self._capacity:
-            self._move(self._dtype, first + number, max(2 * self._capacity, self._expected))
+        self._make_room(number)
         self._count += number
         new = self.rows[first:]
         if self._ragged:
             new[:] = self._blank()
         if len(groups) == 1:
             self._write(groups[0], new, slice(None))
-            return
-        ranks = _ranks([group.places for group in groups], len(batch))
+        else:
+            ranks = _ranks([group.places for group in groups], len(batch))
+            for group in groups:
+                self._write(group, new, ranks[group.places])
+        if self._place is not None:
+            self._learn(groups)
+
+    def _learn(self, groups: list[Group]) -> None:
+        """Let the fast lane know the layouts of these groups; it is closed if they are not for it, or too many."""
         for group in groups:
-            self._write(group, new, ranks[group.places])
+            size = group.messages.shape[1]
+            self._express[size, id(group.layout)] = (size, group.layout)
+        plans = [self._plan(layout) for _, layout in self._express.values()]
+        if any(leaves for _, leaves in plans) or len(plans) > MAX_LAYOUTS:
+            self._place = None
+            return
+        known = zip(self._express.values(), plans, strict=True)
+        self._recipes = recipes([(size, layout, runs) for (size, layout), (runs, _) in known])
 
     # -- storage -----------------------------------------------------------------------------------------------------
 
@@ -152,6 +174,11 @@ class Table:
         if dtype != self._dtype:
             self._move(dtype, self._count, self._capacity)
             self._plans.clear()
+
+    def _make_room(self, number: int) -> None:
+        """Make room for so many more rows."""
+        if self._count + number > self._capacity:
+            self._move(self._dtype, self._count + number, max(2 * self._capacity, self._expected))
 
     def _move(self, dtype: np.dtype[np.void], rows: int, room: int) -> None:
         """Move the rows to a new store for `rows` rows, or for `room` if that is more and not too much."""
@@ -184,9 +211,9 @@ class Table:
 
     # -- values ------------------------------------------------------------------------------------------------------
 
-    def _plan(self, layout: Layout) -> tuple[list[_Run], list[Leaf]]:
+    def _plan(self, layout: Layout) -> tuple[list[Run], list[Leaf]]:
         """How to copy messages of a layout: what can be copied as runs of bytes, and the leaves that cannot."""
-        runs: list[_Run] = []
+        runs: list[Run] = []
         others: list[Leaf] = []
         for leaf in layout.leaves:
             run = self._run(leaf)
@@ -194,20 +221,22 @@ class Table:
                 if leaf.path in self._columns:
                     others.append(leaf)
             elif runs and runs[-1].is_before(run):
-                runs[-1] = _Run(runs[-1].source, runs[-1].target, run.source + run.size - runs[-1].source)
+                runs[-1] = Run(runs[-1].source, runs[-1].target, run.source + run.size - runs[-1].source)
             else:
                 runs.append(run)
         return runs, others
 
-    def _run(self, leaf: Leaf) -> _Run | None:
+    def _run(self, leaf: Leaf) -> Run | None:
         """A leaf as bytes, None if its values are in another form than in the table."""
         column = self._dtype.fields.get(leaf.path) if self._dtype.fields else None
         if column is None or leaf.indices != [()]:
             return None
-        kind, target = column[0], int(column[1])
-        if kind.base != np.dtype(leaf.code) or kind.shape != (() if leaf.block is None else (leaf.block,)):
+        kind, target, code = column[0], int(column[1]), np.dtype(leaf.code)
+        if kind.kind == "S":  # what it does not fill is zero already
+            return Run(leaf.offsets[0], target, code.itemsize)
+        if kind.base != code or kind.shape != (() if leaf.block is None else (leaf.block,)):
             return None
-        return _Run(leaf.offsets[0], target, kind.itemsize)
+        return Run(leaf.offsets[0], target, kind.itemsize)
 
     def _write(self, group: Group, new: NDArray[np.void], rows: slice | Ints) -> None:
         """Write the messages of a group to the rows `rows` of `new`."""
