@@ -9,7 +9,7 @@ import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -19,6 +19,7 @@ from agv_analysis.reproduce import outdated
 from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Finding, check
 from agv_analysis.reproduce.claims import CLAIMS, ON_TRACK
 from agv_analysis.reproduce.figures import figures, write
+from agv_analysis.reproduce.future import _across
 from agv_analysis.reproduce.report import text_of
 from agv_analysis.reproduce.runs import GAINS, gain, recorded, scenario, simulated
 from agv_analysis.scenario import Scenario, load_scenario
@@ -58,6 +59,30 @@ EXPECTED = {
 def findings() -> dict[str, Finding]:
     runs = simulated()
     return {claim.key: check(claim, runs) for claim in CLAIMS}
+
+
+class Made(NamedTuple):
+    """What the command has made, and the page of docs/ made of it."""
+
+    folder: Path
+    page: str
+    content: dict[str, Any]
+
+    def future(self, key: str) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = self.content["future_work"][key]
+        return rows
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    spec = importlib.util.spec_from_file_location("update", REPOSITORY / "docs/update.py")
+    assert spec is not None
+    assert spec.loader is not None
+    update = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(update)
+    folder = tmp_path_factory.mktemp("paper")
+    page = update.paper_page(str(folder))
+    return Made(folder, page, json.loads((folder / "claims.json").read_text()))
 
 
 def line(*settings: str) -> Scenario:
@@ -230,18 +255,16 @@ def test_a_figure_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
         write(figure, tmp_path / "missing")
 
 
-def test_the_command_writes_everything_and_the_page_is_current(tmp_path: Path) -> None:
-    spec = importlib.util.spec_from_file_location("update", REPOSITORY / "docs/update.py")
-    assert spec is not None
-    assert spec.loader is not None
-    update = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(update)
-    assert update.paper_page(str(tmp_path)) == (REPOSITORY / "docs/paper.md").read_text(encoding="utf-8")
-    content = json.loads((tmp_path / "claims.json").read_text())
-    assert {claim["key"]: claim["verdict"] for claim in content["claims"]} == EXPECTED
-    assert content["source"] == "simulation"
+def test_the_page_is_current(made: Made) -> None:
+    assert made.page == (REPOSITORY / "docs/paper.md").read_text(encoding="utf-8")
+
+
+def test_the_command_writes_everything(made: Made) -> None:
+    assert {claim["key"]: claim["verdict"] for claim in made.content["claims"]} == EXPECTED
+    assert made.content["source"] == "simulation"
     for suffix in ("svg", "png", "csv"):
-        assert len(list(tmp_path.glob(f"*.{suffix}"))) >= 8
+        assert len(list(made.folder.glob(f"*.{suffix}"))) == 8
+    assert (made.folder / "future.md").read_text().count("###") == len(made.content["future_work"]) == 7
 
 
 def test_a_directory_that_cannot_be_made_is_one_line(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
@@ -250,3 +273,70 @@ def test_a_directory_that_cannot_be_made_is_one_line(agv_ncs: Callable[..., tupl
     assert status == 1
     assert "cannot be made" in said
     assert "Traceback" not in said
+
+
+# -- future work -------------------------------------------------------------------------------------------------------
+
+
+def test_along_the_track_deadbeat_is_the_fastest(made: Made) -> None:
+    rows = [row for row in made.future("gain_along") if row["speed"] == "unlimited"]
+    assert [row["to 1 cm [steps]"] for row in rows] == [246, 47, 5, 1]
+    assert rows[-1]["K_x [1/s]"] == 1.0 / TS
+
+
+@pytest.mark.parametrize(("ky", "ktheta"), [(5.0, 4.0), (1.0, 2.0), (30.0, 8.0)])
+def test_settling_across_is_that_of_the_linear_error(ky: float, ktheta: float) -> None:
+    v_r = [1.0 - 0.5 * math.cos(8.0 * math.pi * k / 20000) for k in range(3000)]
+    y, theta, last = 0.05, 0.0, -1
+    for k, v in enumerate(v_r):
+        if abs(y) >= 0.01 or abs(theta) >= 0.01:
+            last = k
+        y, theta = y + TS * v * theta, theta - TS * v * (ky * y + ktheta * theta)
+    steps = _across(ky, ktheta, (0.05, 0.0, 0.5 * math.pi))
+    assert steps is not None
+    assert abs(steps - (last + 1)) <= 3
+
+
+@pytest.mark.parametrize("n", [5, 10, 20, 50, 100])
+@pytest.mark.parametrize("kx", GAINS)
+def test_a_single_burst_overshoots_as_the_scalar_loop_does(made: Made, kx: float, n: int) -> None:
+    y_r = np.cumsum([0.0, *(TS * (1.0 - 0.5 * math.cos(8.0 * math.pi * k / 20000)) for k in range(400))])
+    y = [5.0]
+    for k in range(400):
+        held = y[0] if 1 <= k <= n else y[k]
+        y.append(y[k] + (y_r[k + 1] - y_r[k]) + TS * kx * (y_r[k] - held))
+    overshoot = max(0.0, float(np.max(y_r - y))) / 5.0
+    (row,) = (row for row in made.future("single_burst") if row["n"] == n and row["speed"] == "unlimited")
+    assert row[f"K_x = {kx:g} overshoot"] == pytest.approx(overshoot, rel=2e-3, abs=1e-9)
+
+
+@pytest.mark.parametrize("track", ["line", "paper"])
+def test_twins_agree_with_the_closed_forms_and_not_with_the_paper_s_test(made: Made, track: str) -> None:
+    for row in made.future("criteria"):
+        if row["track"] != track:
+            continue
+        a = TS * row["K_x [1/s]"]
+        constant = max(n for n in range(100) if a < 2.0 * math.sin(math.pi / (2.0 * (2 * n + 1))) - 1e-12)
+        burst = max(n for n in range(100) if (n + 1) * a < 2.0 - 1e-12)
+        assert row["constant n"] == row["constant n, twins"] == constant
+        assert row["bursts"] == row["bursts, twins"] == burst
+        assert row["independent losses, mean square"] == pytest.approx((2.0 - a) / (2.0 + a), rel=1e-3)
+        assert row["paper's test"] == "any" or row["paper's test"] > 2000
+
+
+def test_a_limit_on_the_speed_bounds_what_is_unstable(made: Made) -> None:
+    for row in made.future("limit"):
+        stable = (row["n"] + 1) * TS * 25.0 < 2.0
+        assert (row["unlimited: twins"] == "come closer") == stable
+        assert row["limited: largest error [m]"] < 6.5 * TS * (row["n"] + 1)  # what one burst can drive
+
+
+def test_outages_never_help(made: Made) -> None:
+    rows = [row for row in made.future("loss_probability") if row["speed"] == "unlimited"]
+    assert [row["p"] for row in rows] == [0.0, 0.2, 0.4, 0.6, 0.8, 0.9]
+    assert rows[0]["K_x = 25 [m s]"] == pytest.approx(TS * 5.0 / (TS * 25.0), rel=1e-2)  # a geometric series
+    for kx in GAINS:
+        assert (
+            rows[-1][f"K_x = {kx:g} [m s]"] is None or rows[-1][f"K_x = {kx:g} [m s]"] > rows[0][f"K_x = {kx:g} [m s]"]
+        )
+    assert [row["K_x = 250 part"] for row in rows[:1] + rows[-2:]] == [0.0, 1.0, 1.0]

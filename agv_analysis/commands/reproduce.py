@@ -18,17 +18,20 @@ if TYPE_CHECKING:
 )  # fmt: skip
 @click.option("--ros", is_flag=True, help="Measure on recorded runs of the nodes instead of simulated ones.")
 def command(out: Path, ros: bool) -> None:
-    """Reproduce the paper: its figures, and every claim of its text with what was measured.
+    """Reproduce the paper: its figures, every claim of its text with what was measured, and its future work.
 
     \b
     Examples:
       agv-ncs reproduce
       agv-ncs reproduce --out paper_on_dds --ros
     """
+    from rich.console import Console
+
     from agv_analysis.reproduce import report
     from agv_analysis.reproduce.claim import check
     from agv_analysis.reproduce.claims import CLAIMS
     from agv_analysis.reproduce.figures import figures, write
+    from agv_analysis.reproduce.future import tables
     from agv_ros.errors import UserError
 
     try:
@@ -36,11 +39,16 @@ def command(out: Path, ros: bool) -> None:
     except OSError as error:
         raise UserError(f"{out}: cannot be made: {error.strerror}") from None
     runs = _runs(out, ros)
-    for figure in figures(runs):
-        write(figure, out)
-    findings = [check(claim, runs) for claim in CLAIMS]
+    with Console(stderr=True).status("driving the paper's runs ..."):
+        for figure in figures(runs):
+            write(figure, out)
+        findings = [check(claim, runs) for claim in CLAIMS]
     report.print_claims(findings)
-    report.write(findings, [], "recorded runs" if ros else "simulation", out)
+    with Console(stderr=True).status("simulating its future work ..."):
+        found = list(tables())
+    for table in found:
+        report.print_table(table)
+    report.write(findings, found, "recorded runs" if ros else "simulation", out)
     click.echo(f"figures and tables: {out}")
 
 

@@ -40,12 +40,15 @@ def final_error(scenario: Scenario, n: int) -> float:
 
 
 def contraction(scenario: Scenario, n: int) -> float:
-    """Distance of twins at the end of such a run, as a multiple of that at its beginning; inf if one diverged."""
+    """Distance of twins at the end of such a run, as a multiple of that at its beginning; inf if one diverged.
+
+    The largest of the last hundredth of the run: a distance that oscillates may be small at any one step.
+    """
     run, twin = poses(scenario, n), poses(scenario, n, TWIN_OFFSET)
     if len(run) != len(twin) or len(run) < steps_of(scenario):
         return math.inf
-    begun, ended = (math.hypot(*(twin[k] - run[k]).tolist()) for k in (0, -1))
-    return ended / begun
+    apart = [math.hypot(*moved) for moved in (twin - run).tolist()]
+    return max(apart[-max(1, len(apart) // 100) :]) / apart[0]
 
 
 def drive(reference: Rows, start: Loop, settings: Settings, n: int, rows: NDArray[np.float64]) -> int:
