@@ -70,7 +70,10 @@ def test_a_parked_agv_and_a_deadbeat_loop_contract_although_the_paper_s_test_say
 def test_a_gain_beyond_the_loop_s_reach() -> None:
     """T_s K_x > 2 overshoots by more than it corrects."""
     found = of("controller.kx=401.0", "error_detector.track=line")
-    assert (found.n_lifted, found.n_bursts, found.p_mean_square, found.p_almost_sure) == (-1, -1, -1.0, -1.0)
+    assert (found.n_lifted, found.n_bursts, found.p_mean_square, found.p_almost_sure) == (-1, -1, None, None)
+    for name in ("p_max.mean_square", "p_max.almost_sure"):
+        assert "even without losses" in found.reasons[name]
+    assert found.to_json()["p_max"]["mean_square_reason"] == found.reasons["p_max.mean_square"]
 
 
 def test_without_a_gain_along_the_track_nothing_is_proved() -> None:

@@ -99,7 +99,7 @@ def _rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
     def told(value: float | None, name: str, text: str) -> str:
         reason = found.reasons.get(name)
         if value is None:
-            return f"no bound: {reason}"
+            return reason or "unknown"
         return text if reason is None else f"{text} ({reason})"
 
     def steps(n: int | None) -> str:
@@ -116,12 +116,10 @@ def _rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
     yield "Independent losses, almost surely", told(p, "p_max.almost_sure", _probability(p))
     rate = "" if found.loss_rate is None else f" at a loss rate of {found.loss_rate:.4g}"
     burst = found.burst_mean_square
-    text = "" if burst is None else "no burst is short enough" if burst < 0 else f"{burst:.4g} slots on average"
+    text = "" if burst is None else f"{burst:.4g} slots on average"
     yield f"Bursts, mean square{rate}", told(burst, "burst_max.mean_square", text)
     yield "What binds", "nothing" if found.binding is None else f"the error {found.binding} the track"
 
 
 def _probability(p: float | None) -> str:
-    if p is None:
-        return ""
-    return "does not contract even without losses" if p < 0.0 else f"below {p:.5g}"
+    return "" if p is None else f"below {p:.5g}"

@@ -20,7 +20,11 @@ ALONG, ACROSS = "along", "across"
 
 @dataclass(frozen=True)
 class Margins:
-    """Margins of a loop on its track. None: there is no bound, or none could be found; `reasons` says which and why."""
+    """Margins of a loop on its track.
+
+    None: there is no bound, or the criterion is not met at all; `reasons` says which. A number of steps of -1: the
+    loop does not contract even if every pose is fresh.
+    """
 
     n_paper: int | None
     """Largest constant n_ul for which the paper's test holds at every step of a lap."""
@@ -102,19 +106,22 @@ def margins(scenario: Scenario) -> Margins:
     n_paper = paper.largest_n(theta, v_r, gains, ts)
     if n_paper is None:
         reasons["n_max.paper"] = (
-            "the test holds for every n: it sees an outdated pose only by how far the heading has turned since"
+            "no bound: the test holds for every n, since it sees an outdated pose only by how far the heading has turned since"
         )
     n_lifted = floquet.largest_constant_delay(v_r, w_r, gains, ts)
     if n_lifted is None:
-        reasons["n_max.lifted"] = "the lap contracts for every n that was tried, up to 10000"
+        reasons["n_max.lifted"] = "no bound: the lap contracts for every n that was tried, up to 10000"
     n_bursts, refuted = bursts.largest_n(v_r, w_r, gains, ts)
     if n_bursts is None:
-        reasons["n_max.bursts"] = "every burst that was tried contracts, up to 1000 slots"
+        reasons["n_max.bursts"] = "no bound: every burst that was tried contracts, up to 1000 slots"
     elif refuted is not None and refuted > n_bursts + 1:
         reasons["n_max.bursts"] = f"proved up to {n_bursts}, refuted from {refuted} on, between them undecided"
+    p_mean_square = _none_below_zero(mean_square.critical_loss(v_r, w_r, gains, ts), "p_max.mean_square", reasons)
     p_almost_sure = almost_sure.critical_loss(v_r, w_r, gains, ts)
-    if p_almost_sure is None:
-        reasons["p_max.almost_sure"] = "almost every run converges at every loss probability up to 0.999"
+    if p_almost_sure is not None:
+        p_almost_sure = _none_below_zero(p_almost_sure, "p_max.almost_sure", reasons)
+    else:
+        reasons["p_max.almost_sure"] = "no bound: almost every run converges at every loss probability up to 0.999"
     if almost_sure.is_degenerate(ts * gains.kx) and not np.any(w_r):
         reasons.setdefault(
             "p_max.almost_sure",
@@ -125,7 +132,7 @@ def margins(scenario: Scenario) -> Margins:
         n_paper=n_paper,
         n_lifted=n_lifted,
         n_bursts=n_bursts,
-        p_mean_square=mean_square.critical_loss(v_r, w_r, gains, ts),
+        p_mean_square=p_mean_square,
         p_almost_sure=p_almost_sure,
         loss_rate=loss_rate,
         burst_mean_square=burst,
@@ -159,13 +166,23 @@ def _burst(scenario: Scenario, v_r: Floats, w_r: Floats, reasons: dict[str, str]
     loss_rate = None if chain is None else chain.loss_rate
     name = "burst_max.mean_square"
     if loss_rate is None:
-        reasons[name] = f"the loss rate of the channel {scenario.relay.uplink.model} has no closed form"
+        reasons[name] = f"no answer: the loss rate of the channel {scenario.relay.uplink.model} has no closed form"
         return None, None
     if not 0.0 < loss_rate < 1.0:
-        reasons[name] = f"the scenario's uplink loses {'nothing' if loss_rate == 0.0 else 'everything'}"
+        reasons[name] = f"no answer: the scenario's uplink loses {'nothing' if loss_rate == 0.0 else 'everything'}"
         return loss_rate, None
     found = mean_square.critical_burst(loss_rate, v_r, w_r, scenario.controller, scenario.plant.ts)
     if math.isinf(found):
-        reasons[name] = "bursts of a million slots on average are not too long"
+        reasons[name] = "no bound: bursts of a million slots on average are not too long"
         return loss_rate, None
-    return loss_rate, found
+    return loss_rate, _none_below_zero(found, name, reasons)
+
+
+def _none_below_zero(margin: float, name: str, reasons: dict[str, str]) -> float | None:
+    """The margin; None, with the reason, where the criterion is not met at all."""
+    if margin >= 0.0:
+        return margin
+    reasons[name] = "not met: at this loss rate no burst is short enough" if "burst" in name else (
+        "not met: the error does not contract even without losses"
+    )  # fmt: skip
+    return None
