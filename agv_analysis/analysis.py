@@ -14,6 +14,7 @@ from agv_analysis.run import Floats, Run
 from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
 from agv_analysis.stability.verdict import Verdict, judge
+from agv_ros.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -31,20 +32,77 @@ class PaperTest:
         return self.radius < 1.0
 
 
+GAINS_UNKNOWN = "the controller's gains are not known: name its params file with --config"
+
+_OF_GAINS = (
+    "paper_stable", "paper_radius", "lifted_stable", "lifted_radius", "bursts_stable", "bursts_verdict",
+    "bursts_radius_lower", "bursts_radius_upper", "mean_square_stable", "mean_square_growth",
+    "floquet_multiplier_per_step", "contraction_per_step", "verdict", "verdict_criterion", "margin",
+)  # fmt: skip
+"""Figures that nobody knows without the gains."""
+
+
 @dataclass(frozen=True)
-class Analysis:
-    """A run and what follows from it."""
+class Observations:
+    """A run and what can be seen in it, whatever the controller's gains were."""
 
     run: Run
     outages: Outages
     convergence: Convergence
+    fit: ChannelFit
+    """The uplink as fitted to the run."""
+
+    @property
+    def n(self) -> int:
+        """The outdatedness that the stability criteria are asked about: the largest n_ul of the run."""
+        return self.outages.n_ul_max
+
+    def disagreements(self) -> list[str]:
+        """None: without gains there are no criteria that could disagree."""
+        return []
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name, for `--json`; steps count from the run's first, SI units; null: the run cannot say."""
+        run, up, down = self.run, self.outages.uplink, self.outages.downlink
+        return {
+            "source": run.source,
+            "steps": len(run),
+            "ts": run.ts,
+            "seed": run.scenario.relay.seed if run.gains_known else None,
+            "valid": not run.unexplained,
+            "unexplained": dict(run.unexplained),
+            "notes": list(run.notes),
+            "loss_rate": up.loss_rate,
+            "n_ul_max": self.n,
+            "n_ul_mean": up.age.mean,
+            "n_ul_p99": up.age.p99,
+            "mean_burst": up.mean_burst,
+            "outage_lengths": {str(length): count for length, count in up.histogram.items()},
+            "downlink_loss_rate": down.loss_rate,
+            "settle_1cm_steps": self.convergence.settle_1cm_steps,
+            "settle_2pct_steps": self.convergence.settle_2pct_steps,
+            "overshoot": self.convergence.overshoot,
+            "damping": self.convergence.damping,
+            "final_error": _finite(self.convergence.position.final),
+            "max_error": _finite(self.convergence.position.peak),
+            "iae": _finite(self.convergence.y.iae),
+            "ise": _finite(self.convergence.y.ise),
+            "channel_fit": _fit_to_json(self.fit),
+            **dict.fromkeys(_OF_GAINS),
+            "no_verdict_because": None if run.gains_known else GAINS_UNKNOWN,
+            "disagreements": self.disagreements(),
+        }
+
+
+@dataclass(frozen=True)
+class Analysis(Observations):
+    """A run and what follows from it and from the controller's gains."""
+
     paper: PaperTest
     lifted_radius: float
     """Largest spectral radius of the lifted system over the track, for a pose as old as the oldest of the run."""
     bursts: BurstVerdict
     """Verdict for arbitrary bursts of up to as many lost poses as the longest outage of the run."""
-    fit: ChannelFit
-    """The uplink as fitted to the run."""
     mean_square_growth: float
     """Growth (logarithm, per step) of E[e^2] under the fitted channel."""
     floquet: float | None
@@ -52,11 +110,6 @@ class Analysis:
     contraction: float | None
     """The same about the motion that was driven, measured on the recorded poses."""
     verdict: Verdict
-
-    @property
-    def n(self) -> int:
-        """The outdatedness that the stability criteria are asked about: the largest n_ul of the run."""
-        return self.outages.n_ul_max
 
     @property
     def lifted_stable(self) -> bool:
@@ -95,31 +148,9 @@ class Analysis:
         return found
 
     def to_json(self) -> dict[str, Any]:
-        """The figures by name, for `--json`; steps count from the run's first, SI units; null: the run cannot say."""
-        run, up, down = self.run, self.outages.uplink, self.outages.downlink
+        """The figures by name, as `Observations.to_json`."""
         return {
-            "source": run.source,
-            "steps": len(run),
-            "ts": run.ts,
-            "seed": run.scenario.relay.seed,
-            "valid": not run.unexplained,
-            "unexplained": dict(run.unexplained),
-            "notes": list(run.notes),
-            "loss_rate": up.loss_rate,
-            "n_ul_max": self.n,
-            "n_ul_mean": up.age.mean,
-            "n_ul_p99": up.age.p99,
-            "mean_burst": up.mean_burst,
-            "outage_lengths": {str(length): count for length, count in up.histogram.items()},
-            "downlink_loss_rate": down.loss_rate,
-            "settle_1cm_steps": self.convergence.settle_1cm_steps,
-            "settle_2pct_steps": self.convergence.settle_2pct_steps,
-            "overshoot": self.convergence.overshoot,
-            "damping": self.convergence.damping,
-            "final_error": _finite(self.convergence.position.final),
-            "max_error": _finite(self.convergence.position.peak),
-            "iae": _finite(self.convergence.y.iae),
-            "ise": _finite(self.convergence.y.ise),
+            **super().to_json(),
             "paper_stable": self.paper.stable,
             "paper_radius": _finite(self.paper.radius),
             "lifted_stable": self.lifted_stable,
@@ -128,7 +159,6 @@ class Analysis:
             "bursts_verdict": self.bursts.verdict,
             "bursts_radius_lower": _finite(self.bursts.lower),
             "bursts_radius_upper": _finite(self.bursts.upper),
-            "channel_fit": _fit_to_json(self.fit),
             "mean_square_stable": self.mean_square_growth < 0.0,
             "mean_square_growth": _finite(self.mean_square_growth),
             "floquet_multiplier_per_step": self.floquet,
@@ -136,7 +166,6 @@ class Analysis:
             "verdict": self.verdict.word,
             "verdict_criterion": self.verdict.criterion,
             "margin": self.verdict.margin,
-            "disagreements": self.disagreements(),
         }
 
 
@@ -145,8 +174,15 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
+def observe(run: Run) -> Observations:
+    """What can be seen in a run, be its gains known or not. Raises UserError if the run has no step."""
+    return Observations(run=run, outages=outages(run), convergence=convergence(run), fit=fit_channel(run.lost))
+
+
 def analyse(run: Run) -> Analysis:
-    """Analysis of a run, recorded or simulated. Raises UserError if the run has no step."""
+    """Analysis of a run, recorded or simulated. Raises UserError if the run has no step or its gains are unknown."""
+    if not run.gains_known:
+        raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
     out, fit = outages(run), fit_channel(run.lost)
     v_r, w_r, gains = run.reference[:, 3], run.reference[:, 4], run.scenario.controller
     growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain) / len(run)

@@ -40,6 +40,8 @@ class Run:
     """Messages by topic that are missing although no channel lost them; with any of them the run proves nothing."""
     notes: tuple[str, ...] = ()
     """What a reader must know of the recording: damage, repeated steps, parameters that do not fit."""
+    gains_known: bool = True
+    """Are the gains and limits in `scenario.controller` those of the run? Else they mean nothing."""
 
     @property
     def ts(self) -> float:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from agv_analysis.analysis import Analysis
+from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.channel_fit import Estimate
 
 
-def print_table(analysis: Analysis) -> None:
+def print_table(analysis: Observations) -> None:
     """Print the figures, then one line for each disagreement between the criteria, then the notes."""
     from rich.console import Console
     from rich.markup import escape
@@ -32,10 +32,11 @@ def print_table(analysis: Analysis) -> None:
         console.print(f"[dim]Note: {escape(note)}.[/]")
 
 
-def _rows(analysis: Analysis) -> Iterator[tuple[str, str]]:
+def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     run, up = analysis.run, analysis.outages.uplink
     ms = 1e3 * run.ts
-    yield "Run", f"{len(run)} steps of {ms:g} ms, seed {run.scenario.relay.seed}"
+    seed = f", seed {run.scenario.relay.seed}" if run.gains_known else ""
+    yield "Run", f"{len(run)} steps of {ms:g} ms{seed}"
     yield "Uplink", f"{up.loss_rate:.2%} lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
     yield "Longest outage", f"{up.longest} slots ({up.longest * ms:g} ms)"
     yield (
@@ -50,6 +51,13 @@ def _rows(analysis: Analysis) -> Iterator[tuple[str, str]]:
     yield "Damping of the speed", found.damping or "the run cannot tell"
     yield "Error", f"at most {found.position.peak:.3g} m, {found.position.final:.3g} m at the end"
     yield "Fitted channel", _fit(analysis)
+    if isinstance(analysis, Analysis):
+        yield from _criteria(analysis)
+    else:
+        yield "Stability", f"not judged: {GAINS_UNKNOWN}"
+
+
+def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
     yield (
         "Paper's test",
         _verdict(analysis.paper.stable, f"|lambda| at most {analysis.paper.radius:.6g}, at step {analysis.paper.k}"),
@@ -75,7 +83,7 @@ def _rows(analysis: Analysis) -> Iterator[tuple[str, str]]:
     yield "Margin", verdict.margin
 
 
-def _fit(analysis: Analysis) -> str:
+def _fit(analysis: Observations) -> str:
     fit = analysis.fit
     if fit.model == "perfect":
         return "perfect"

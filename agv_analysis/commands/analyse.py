@@ -17,9 +17,16 @@ from agv_analysis.commands import write_json
 )
 @click.option("--namespace", help="Which loop, for a bag of several.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
+@click.option("--pose-topic", help="Another robot's pose: Odometry, PoseWithCovarianceStamped or PoseStamped.")
+@click.option("--command-topic", help="Another robot's command: Twist or TwistStamped.")
+@click.option("--reference-topic", help="Another robot's reference: Odometry, or Path with times.")
+@click.option("--track-file", type=click.Path(path_type=Path), help="Another robot's reference: CSV file with t, v, w.")
+@click.option("--topics", type=click.Path(path_type=Path), help="YAML file with the topics: pose, command, reference.")
 def command(
-    bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None
-) -> None:
+    bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None,
+    pose_topic: str | None, command_topic: str | None, reference_topic: str | None, track_file: Path | None,
+    topics: Path | None,
+) -> None:  # fmt: skip
     """Say from the recording BAG whether the loop is stable, and why.
 
     \b
@@ -27,14 +34,20 @@ def command(
       agv-ncs analyse bags/first
       agv-ncs analyse bags/first --json first.json --picture first.png
       agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
+      agv-ncs analyse robot --pose-topic /odom --command-topic /cmd_vel --reference-topic /plan
     """
-    from agv_analysis.analysis import analyse
+    from agv_analysis.analysis import analyse, observe
+    from agv_analysis.other_robots import read_robot_run, read_topics
     from agv_analysis.picture import draw
     from agv_analysis.recording import read_run
     from agv_analysis.table import print_table
 
-    run = read_run(bag, config, namespace)
-    analysis = analyse(run)
+    if any((pose_topic, command_topic, reference_topic, track_file, topics)):
+        names = read_topics(topics, pose_topic, command_topic, reference_topic)
+        run = read_robot_run(bag, names, track_file, config)
+    else:
+        run = read_run(bag, config, namespace)
+    analysis = analyse(run) if run.gains_known else observe(run)
     where = picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png"))
     draw(run, where)
     print_table(analysis)

@@ -1,0 +1,318 @@
+"""Recordings of other robots, written with rosbags from a simulated run whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from agv_analysis.analysis import analyse, observe
+from agv_analysis.convergence import wrapped
+from agv_analysis.other_robots import RobotTopics, read_robot_run, read_topics
+from agv_analysis.run import Run
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate
+from agv_ros.errors import UserError
+
+REPOSITORY = Path(__file__).parents[1]
+STORE = get_typestore(Stores.ROS2_JAZZY)
+START, TS = 1_700_000_000_250_000_000, 20_000_000  # [ns]
+LATENCY = 3_000_000
+"""From a pose's stamp to its log time [ns]; the clock of the log is another one, an hour ahead."""
+LOG = LATENCY + 3_600_000_000_000
+
+PAPER = str(REPOSITORY / "config/paper.yaml")
+SETTINGS = (
+    "plant.ts=0.02", "plant.duration=8.0", "controller.kx=5.0", "relay.uplink.model=bernoulli", "relay.uplink.p=0.2",
+    "plant.initial_pose=[0.5, 1.0, 1.5]",
+)  # fmt: skip
+ALL = RobotTopics("/odom", "/cmd_vel", "/plan")
+
+
+def make(kind: str, **fields: Any) -> Any:
+    return STORE.types[kind](**fields)
+
+
+def header(stamp: int, frame: str = "odom") -> Any:
+    time = make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return make("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+
+def vector(x: float, y: float, z: float = 0.0) -> Any:
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def twist(v: float, w: float) -> Any:
+    return make("geometry_msgs/msg/Twist", linear=vector(v, 0.0), angular=vector(0.0, 0.0, w))
+
+
+def posture(x: float, y: float, theta: float) -> Any:
+    q = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(theta / 2), w=np.cos(theta / 2))
+    return make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", x=x, y=y, z=0.0), orientation=q)
+
+
+def odometry(stamp: int, pose: Any, v: float = 0.0, w: float = 0.0, frame: str = "odom") -> Any:
+    covariance = np.zeros(36)
+    return make(
+        "nav_msgs/msg/Odometry",
+        header=header(stamp, frame),
+        child_frame_id="base_link",
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+        twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist(v, w), covariance=covariance),
+    )
+
+
+def with_covariance(stamp: int, pose: Any) -> Any:
+    inner = make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    return make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp), pose=inner)
+
+
+def stamped(stamp: int, pose: Any, frame: str = "odom") -> Any:
+    return make("geometry_msgs/msg/PoseStamped", header=header(stamp, frame), pose=pose)
+
+
+def twist_stamped(stamp: int, v: float, w: float) -> Any:
+    return make("geometry_msgs/msg/TwistStamped", header=header(stamp), twist=twist(v, w))
+
+
+def unstamped(stamp: int, v: float, w: float) -> Any:
+    return twist(v, w)
+
+
+def path_of(truth: Run, steps: range, times: bool = True) -> Any:
+    poses = [stamped(START + k * TS if times else 0, posture(*truth.reference[k, :3])) for k in steps]
+    return make("nav_msgs/msg/Path", header=header(START), poses=poses)
+
+
+class Recording:
+    """Messages of a bag: (topic, log time, message)."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[str, int, Any]] = []
+
+    def add(self, topic: str, log_time: int, message: Any) -> None:
+        self.messages.append((topic, log_time, message))
+
+    def write(self, path: Path, plugin: StoragePlugin = StoragePlugin.MCAP) -> Path:
+        with Writer(path, version=9, storage_plugin=plugin) as writer:
+            connections: dict[str, Any] = {}
+            for topic, log_time, message in sorted(self.messages, key=lambda entry: entry[1]):
+                kind = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+                writer.write(connections[topic], log_time, STORE.serialize_cdr(message, kind))
+        return path
+
+
+@pytest.fixture(scope="module")
+def truth() -> Run:
+    run = simulate(load_scenario(PAPER, SETTINGS))
+    assert not run.lost[0]
+    assert run.lost.any()
+    return run
+
+
+Make = Callable[..., Any]
+
+
+def recording(
+    truth: Run, pose: Make = odometry, command: Make = unstamped, reference: str = "path", jitter: int = 0
+) -> Recording:
+    """What was received of the run, by a robot of these types, with other topics in the way."""
+    made, shifts = Recording(), np.random.default_rng(1).integers(-jitter, jitter + 1, len(truth))
+    text = make("std_msgs/msg/String", data="hello")
+    transform = make("geometry_msgs/msg/Transform", translation=vector(1.0, 2.0), rotation=posture(0, 0, 0).orientation)
+    for k, received in enumerate(~truth.lost):
+        stamp = START + k * TS + (int(shifts[k]) if k else 0)
+        made.add("/chatter", stamp + LOG, text)
+        one = make("geometry_msgs/msg/TransformStamped", header=header(stamp), child_frame_id="base_link",
+                   transform=transform)  # fmt: skip
+        made.add("/tf", stamp + LOG, make("tf2_msgs/msg/TFMessage", transforms=[one] * (k % 3)))
+        if received:
+            made.add("/odom", stamp + LOG, pose(stamp, posture(*truth.pose[k])))
+        made.add("/cmd_vel", stamp + LOG + 2_000_000, command(stamp + 2_000_000, *truth.command[k]))
+        if reference == "odometry":
+            x, y, theta, v, w = truth.reference[k]
+            made.add("/plan", stamp + LOG - LATENCY, odometry(START + k * TS, posture(x, y, theta), v, w))
+    if reference == "path":
+        made.add("/plan", START, path_of(truth, range(len(truth))))
+    return made
+
+
+def assert_is_the_truth(run: Run, truth: Run, tolerance: float = 1e-9) -> None:
+    """As far as the last pose that came."""
+    n = int(np.flatnonzero(~truth.lost)[-1]) + 1
+    assert len(run) == n
+    np.testing.assert_array_equal(run.lost, truth.lost[:n])
+    np.testing.assert_array_equal(run.n_ul, truth.n_ul[:n])
+    came = ~run.lost
+    np.testing.assert_allclose(run.pose[came, :2], truth.pose[:n][came, :2], rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(wrapped(run.pose[came, 2] - truth.pose[:n][came, 2]), 0.0, atol=tolerance)
+    np.testing.assert_allclose(run.command[came], truth.command[:n][came], rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(run.reference[:, :2], truth.reference[:n, :2], rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(wrapped(run.reference[:, 2] - truth.reference[:n, 2]), 0.0, atol=tolerance)
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("pose", [odometry, with_covariance, stamped])
+@pytest.mark.parametrize("command", [unstamped, twist_stamped])
+def test_the_run_comes_back_whatever_the_types(
+    tmp_path: Path, truth: Run, plugin: StoragePlugin, pose: Make, command: Make
+) -> None:
+    run = read_robot_run(recording(truth, pose, command).write(tmp_path / "bag", plugin), ALL)
+    assert run.ts == pytest.approx(0.02, abs=1e-15)
+    assert not run.gains_known
+    assert_is_the_truth(run, truth)
+
+
+def test_lost_poses_lie_between_those_that_came(tmp_path: Path, truth: Run) -> None:
+    run = read_robot_run(recording(truth).write(tmp_path / "bag"), ALL)
+    k = int(np.flatnonzero(run.lost & ~np.roll(run.lost, 1) & ~np.roll(run.lost, -1))[0])
+    np.testing.assert_allclose(run.pose[k], (run.pose[k - 1] + run.pose[k + 1]) / 2, atol=1e-12)
+    assert any("count as lost" in note for note in run.notes)
+
+
+def test_speeds_of_a_path_are_those_that_drew_it(tmp_path: Path, truth: Run) -> None:
+    """The reference is an Euler recursion, of which the differences are exactly the speeds."""
+    run = read_robot_run(recording(truth).write(tmp_path / "bag"), ALL)
+    np.testing.assert_allclose(run.reference[:-1, 3:], truth.reference[: len(run) - 1, 3:], rtol=0.0, atol=1e-9)
+
+
+def test_reference_from_odometry(tmp_path: Path, truth: Run) -> None:
+    run = read_robot_run(recording(truth, reference="odometry").write(tmp_path / "bag"), ALL)
+    assert_is_the_truth(run, truth)
+    np.testing.assert_allclose(run.reference[:, 3:], truth.reference[: len(run), 3:], rtol=0.0, atol=1e-12)
+
+
+def test_a_plan_is_followed_until_the_next_one_begins(tmp_path: Path, truth: Run) -> None:
+    made, wrong = recording(truth, reference="none"), truth.reference.copy()
+    wrong[200:, :2] += 7.0
+    stale = path_of(truth, range(200))
+    stale.poses.extend(stamped(START + k * TS, posture(*wrong[k, :3])) for k in range(200, len(truth)))
+    made.add("/plan", START, stale)
+    made.add("/plan", START + 200 * TS, path_of(truth, range(200, len(truth))))
+    made.add("/plan", START + 201 * TS, make("nav_msgs/msg/Path", header=header(START), poses=[]))
+    assert_is_the_truth(read_robot_run(made.write(tmp_path / "bag"), ALL), truth)
+
+
+def track_file(path: Path, truth: Run) -> Path:
+    rows = [f"{k * truth.ts!r},{v!r},{w!r}" for k, (v, w) in enumerate(truth.reference[:, 3:].tolist())]
+    path.write_text("\n".join(["t,v,w", *rows]) + "\n")
+    return path
+
+
+def test_reference_from_a_track_file(tmp_path: Path, truth: Run) -> None:
+    bag, track = recording(truth, reference="none").write(tmp_path / "bag"), track_file(tmp_path / "track.csv", truth)
+    topics = ALL._replace(reference=None)
+    run = read_robot_run(bag, topics, track)
+    np.testing.assert_allclose(run.reference[0, :3], truth.pose[0])  # nobody says where the track begins
+    config = tmp_path / "params.yaml"
+    config.write_text(truth.scenario.to_yaml())
+    assert_is_the_truth(read_robot_run(bag, topics, track, config), truth)
+    assert_is_the_truth(read_robot_run(bag, topics, None, config), truth, 1e-8)
+
+
+def test_jitter_is_measured_and_loses_nothing(tmp_path: Path, truth: Run) -> None:
+    run = read_robot_run(recording(truth, jitter=4_000_000).write(tmp_path / "bag"), ALL)
+    n = len(run)
+    assert run.ts == pytest.approx(0.02, rel=0.05)
+    np.testing.assert_array_equal(run.lost, truth.lost[:n])
+    assert any("jitter 3." in note for note in run.notes)  # uniform on 8 ms, twice: 8 ms / sqrt(6) = 3.3 ms
+
+
+def test_stamps_that_repeat_or_go_backwards_are_counted(tmp_path: Path, truth: Run) -> None:
+    made = recording(truth)
+    received = [int(k) for k in np.flatnonzero(~truth.lost)]
+    again, late = [START + k * TS for k in received[10:13]], [START + k * TS for k in received[20:25]]
+    for stamp in again:
+        made.add("/odom", stamp + LOG + 1, odometry(stamp, posture(99.0, 99.0, 0.0)))
+    for stamp in late:
+        made.add("/odom", stamp + LOG + 1, odometry(stamp - TS // 3, posture(99.0, 99.0, 0.0)))
+    made.add("/odom", START + LOG + 1, odometry(START + 1, posture(np.nan, 0.0, 0.0)))
+    run = read_robot_run(made.write(tmp_path / "bag"), ALL)
+    assert "/odom: 3 stamps repeat the one before, their messages are left out" in run.notes
+    assert "/odom: 5 stamps go backwards, their messages are left out" in run.notes
+    assert "/odom: 1 poses are not finite or have no orientation, their messages are left out" in run.notes
+    assert_is_the_truth(run, truth)
+
+
+def test_without_gains_nothing_is_said_of_stability(tmp_path: Path, truth: Run) -> None:
+    bag = recording(truth).write(tmp_path / "bag")
+    run = read_robot_run(bag, ALL)
+    found = observe(run).to_json()
+    assert found["loss_rate"] == pytest.approx(np.mean(truth.lost[: len(run)]))
+    assert [found[name] for name in ("paper_stable", "bursts_stable", "mean_square_stable", "verdict")] == [None] * 4
+    assert "--config" in found["no_verdict_because"]
+    with pytest.raises(UserError, match="gains are not known"):
+        analyse(run)
+
+
+def test_with_gains_the_verdict_is_that_of_the_simulated_run(tmp_path: Path, truth: Run) -> None:
+    bag, config = recording(truth).write(tmp_path / "bag"), tmp_path / "params.yaml"
+    config.write_text(truth.scenario.to_yaml())
+    found, expected = analyse(read_robot_run(bag, ALL, None, config)).to_json(), analyse(truth).to_json()
+    assert found["verdict"] == expected["verdict"]
+    assert found["no_verdict_because"] is None
+    assert found["lifted_radius"] == pytest.approx(expected["lifted_radius"], rel=1e-6)
+    assert set(found) == set(expected) == set(observe(truth).to_json())
+
+
+def test_what_does_not_fit_is_said(tmp_path: Path, truth: Run) -> None:
+    made = recording(truth, reference="none")
+    made.add("/plan", START, path_of(truth, range(50), times=False))
+    made.add("/map_plan", START, odometry(START, posture(0, 0, 0), frame="map"))
+    made.add("/map_plan", START + 1, odometry(START + 100 * TS, posture(0, 0, 0), frame="map"))
+    made.add("/early", START, odometry(1, posture(0, 0, 0)))
+    bag = made.write(tmp_path / "bag")
+    for topics, message in (
+        (ALL, "no times of their own"),
+        (ALL._replace(reference="/early"), "no instant in common"),
+        (ALL._replace(pose="/nothing"), "no topic /nothing for the pose; it has .*/odom"),
+        (ALL._replace(pose="/chatter"), "is of type std_msgs/msg/String; a pose must be one of"),
+        (RobotTopics("/odom", "/odom", "/map_plan"), "a command must be one of geometry_msgs/msg/Twist, "),
+        (ALL._replace(reference=None), "no reference: name"),
+    ):
+        with pytest.raises(UserError, match=message):
+            read_robot_run(bag, topics)
+    run = read_robot_run(bag, ALL._replace(reference="/map_plan"))
+    assert any("'odom', /map_plan in frame 'map'" in note for note in run.notes)
+    assert any("poses lie before or after the reference" in note for note in run.notes)
+    assert len(run) <= 101
+
+
+def test_a_wild_stamp_asks_for_no_memory(tmp_path: Path, truth: Run) -> None:
+    made = recording(truth, reference="odometry")
+    made.add("/odom", START + LOG + 10**12, odometry(START + 4 * 10**8 * 10**9, posture(0, 0, 0)))
+    made.add("/plan", START + LOG + 10**12, odometry(START + 4 * 10**8 * 10**9, posture(0, 0, 0)))
+    with pytest.raises(UserError, match=r"a gap of .* at most 1000000 are believed"):
+        read_robot_run(made.write(tmp_path / "bag"), ALL)
+
+
+def test_topics_from_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "topics.yaml"
+    file.write_text("pose: /odom\ncommand: /cmd_vel\n")
+    assert read_topics(file, None, "/other", None) == RobotTopics("/odom", "/other", None)
+    file.write_text("poses: /odom\n")
+    with pytest.raises(UserError, match="found 'poses': '/odom'; allowed are pose, command, reference"):
+        read_topics(file, None, None, None)
+    with pytest.raises(UserError, match="--pose-topic"):
+        read_topics(None, None, "/cmd_vel", None)
+
+
+def test_command_line(tmp_path: Path, truth: Run, agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    bag, report = recording(truth).write(tmp_path / "bag"), tmp_path / "report.json"
+    names = ("--pose-topic", "/odom", "--command-topic", "/cmd_vel", "--reference-topic", "/plan")
+    status, output = agv_ncs("analyse", bag, *names, "--json", report)
+    assert status == 0, output
+    assert "not judged" in output
+    assert "20 ms" in output
+    assert json.loads(report.read_text())["verdict"] is None
+    status, output = agv_ncs("analyse", bag, "--pose-topic", "/nothing", "--reference-topic", "/plan")
+    assert status == 1
+    assert "no topic /nothing" in output
