@@ -22,7 +22,7 @@ import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Chunk, ChunkIndex, DataEnd, Header, McapRecord, Statistics
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
@@ -89,15 +89,15 @@ def _rate_of(messages: Iterable[object]) -> float:
 
 def iterate_support(path: Path, topics: list[str]) -> Iterable[Any]:
     """(schema, channel, record, message) by mcap-ros2-support."""
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+    with path.open("rb") as file:  # the seeking reader, which orders messages, is slower
+        reader = NonSeekingReader(file, decoder_factories=[DecoderFactory()])
         yield from reader.iter_decoded_messages(topics=topics, log_time_order=False)
 
 
 def iterate_mcap(path: Path, topics: list[str]) -> Iterable[Any]:
     """(schema, channel, record) by the mcap library."""
     with path.open("rb") as file:
-        yield from make_reader(file).iter_messages(topics=topics, log_time_order=False)
+        yield from NonSeekingReader(file).iter_messages(topics=topics, log_time_order=False)
 
 
 def iterate_rosbags(path: Path, topics: list[str]) -> Iterable[Any]:
