@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,15 @@ def test_without_a_gain_along_the_track_nothing_is_proved() -> None:
     found = of("controller.kx=0.0", "error_detector.track=line")
     assert found.n_bursts == -1
     assert found.n_lifted == -1
+
+
+def test_the_delay_margin() -> None:
+    """Along the track a = 2 sin(pi / (2 (2 n + 1))) at the margin; K_x = 25: n = 12.06 samples of 5 ms."""
+    found = of("error_detector.track=line")
+    assert found.delay is not None
+    n = found.delay / 0.005
+    assert 2.0 * math.sin(math.pi / (2.0 * (2.0 * n + 1.0))) == pytest.approx(0.125)
+    assert math.floor(n) == found.n_lifted == 12
 
 
 def test_what_binds() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.stability import almost_sure, bursts, floquet, mean_square, paper
+from agv_analysis.stability import almost_sure, bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.chain import chain_of
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference import Reference, lap_steps
@@ -40,6 +40,8 @@ class Margins:
     """Loss rate of the scenario's uplink, None for a channel without a closed form."""
     burst_mean_square: float | None
     """Mean burst [slots] at that loss rate, below which E[e^2] dies out."""
+    delay: float | None
+    """Largest constant delay of the pose [s] on a straight track at the track's largest speed, between samples too."""
     binding: str | None
     """Which error the bursts blow up first: `along` the track or `across` it."""
     reasons: dict[str, str] = field(default_factory=dict)
@@ -87,7 +89,13 @@ class Margins:
             for name in list(values):
                 if f"{group}.{name}" in self.reasons:
                     values[f"{name}_reason"] = self.reasons[f"{group}.{name}"]
-        return {**tree, "loss_rate": self.loss_rate, "binding": self.binding, "disagreements": self.disagreements()}
+        return {
+            **tree,
+            "delay_margin": self.delay,
+            "loss_rate": self.loss_rate,
+            "binding": self.binding,
+            "disagreements": self.disagreements(),
+        }
 
 
 def _steps(n: int) -> str:
@@ -106,7 +114,7 @@ def margins(scenario: Scenario) -> Margins:
     n_paper = paper.largest_n(theta, v_r, gains, ts)
     if n_paper is None:
         reasons["n_max.paper"] = (
-            "no bound: the test holds for every n, since it sees an outdated pose only by how far the heading has turned since"
+            "no bound: the test holds for every n, since it sees an outdated pose only by how far the heading has turned"
         )
     n_lifted = floquet.largest_constant_delay(v_r, w_r, gains, ts)
     if n_lifted is None:
@@ -136,6 +144,7 @@ def margins(scenario: Scenario) -> Margins:
         p_almost_sure=p_almost_sure,
         loss_rate=loss_rate,
         burst_mean_square=burst,
+        delay=_delay(float(np.abs(v_r).max()), gains, ts),
         binding=binding(float(np.abs(v_r).max()), gains, ts),
         reasons=reasons,
     )
@@ -150,6 +159,12 @@ def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
     if across is None or (along is not None and along <= across):
         return ALONG
     return ACROSS
+
+
+def _delay(v: float, gains: ControllerParameters, ts: float) -> float | None:
+    """Sampled delay margin [s] in closed form; None where no loop is stable or nothing can delay it too long."""
+    steps = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(v, gains, ts))
+    return ts * steps if 0.0 < steps < math.inf else None
 
 
 def _lap(scenario: Scenario) -> int:
