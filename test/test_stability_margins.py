@@ -31,7 +31,7 @@ def test_the_canonical_scenario(track: str, kx: float, lifted: int, bursts: int,
     assert found.binding == "along"
     if track == "line":
         assert found.n_paper is None
-        assert "heading" in found.reasons["n_max.paper"]
+        assert "turned" in found.reasons["n_max.paper"]
     else:
         assert found.n_paper is not None
         assert found.n_paper > 2000

@@ -114,7 +114,7 @@ def margins(scenario: Scenario) -> Margins:
     n_paper = paper.largest_n(theta, v_r, gains, ts)
     if n_paper is None:
         reasons["n_max.paper"] = (
-            "no bound: the test holds for every n, since it sees an outdated pose only by how far the heading has turned"
+            "no bound: the test holds for every n, since it sees an outdated pose only by how far it has turned"
         )
     n_lifted = floquet.largest_constant_delay(v_r, w_r, gains, ts)
     if n_lifted is None:
