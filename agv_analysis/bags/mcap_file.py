@@ -386,7 +386,8 @@ class McapFile:
                 return _Cut(position, content), self._source.size
         after = self._source.next_record(position)
         if after is None:
-            self.findings.add(f"end of the file in which there is no record ({why})", at=position, is_loss=True)
+            what = "rest of the file, searched no further" if self._source.has_given_up else "end without a record"
+            self.findings.add(f"{what} ({why})", at=position, is_loss=True)
             return None, self._source.size
         self.findings.add(f"damaged place, passed over ({why})", at=position, is_loss=True)
         return None, after

@@ -114,6 +114,11 @@ class Source:
         """Is this the end of the file's records?"""
         return position == self.size or (position == self.size - len(MAGIC) and self.read(position, 8) == MAGIC)
 
+    @property
+    def has_given_up(self) -> bool:
+        """Has the search for records ended before the file did?"""
+        return self._candidates > _MAX_CANDIDATES
+
     def next_record(self, position: int) -> int | None:
         """Where the next record after `position` begins, None if there is none to be found."""
         position += 1
@@ -121,7 +126,7 @@ class Source:
             window = self.read(position, _WINDOW)
             for found in _RECORD_START.finditer(window):
                 self._candidates += 1
-                if self._candidates > _MAX_CANDIDATES:
+                if self.has_given_up:
                     return None
                 if self.is_record(position + found.start()):
                     return position + found.start()
