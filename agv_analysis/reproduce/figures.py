@@ -56,7 +56,7 @@ def figures(runs: Runs) -> Iterator[Figure]:
         yield Figure(f"{name}_tracks", "x [m]", "y [m]", tracks, is_map=True)
         yield Figure(f"{name}_y_error", "step k", "y_r - y_c [m]", _begin(by_gain, _y_error))
         speeds = _begin(by_gain, lambda run: run.command[:, 0])
-        yield Figure(f"{name}_speed", "step k", "v [m/s]", speeds, linear_to=LIMIT if math.isinf(v_max) else math.inf)
+        yield Figure(f"{name}_speed", "step k", "v [m/s]", speeds, linear_to=10.0 if math.isinf(v_max) else math.inf)
 
 
 def _y_error(run: Run) -> Floats:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from agv_analysis.reproduce.claims import LIMITS, ON_TRACK
 from agv_analysis.reproduce.report import Table
 from agv_analysis.reproduce.runs import GAINS, gain, scenario
 from agv_analysis.simulation import simulate, simulate_batch
+from agv_analysis.simulation.batch import cores
 from agv_analysis.stability import bursts, lifted, mean_square, paper
 from agv_cloud.reference import Reference
 
@@ -164,7 +166,9 @@ def _limits() -> list[Values]:
 
 
 def _criteria() -> list[Values]:
-    return [_criteria_at(track, kx) for track in ("line", "paper") for kx in (*GAINS, 200.0)]
+    loops = [(track, kx) for track in ("line", "paper") for kx in (*GAINS, 200.0)]
+    with ThreadPoolExecutor(cores()) as pool:
+        return list(pool.map(lambda loop: _criteria_at(*loop), loops))
 
 
 def _criteria_at(track: str, kx: float) -> Values:
