@@ -1,8 +1,8 @@
 """From somebody else's recording to a run: a pose, a command and a reference in the types that robots use.
 
 Such a bag has no slots that say what the radio lost. What is known comes from the stamps of the poses: their median
-distance, where none is missing, is the sampling period T_s, and a gap of m periods stands for m - 1 lost poses. So the
-bag should be recorded where the controller runs.
+distance, where none is missing, is a period, a gap of m periods stands for m - 1 lost poses, and the whole time divided
+by all periods is T_s. So the bag should be recorded where the controller runs.
 """
 
 from __future__ import annotations
@@ -257,7 +257,7 @@ class Sampling(NamedTuple):
     """How the poses were sampled, from their stamps."""
 
     period: float
-    """T_s [ns]: the median distance of two stamps with no loss in between."""
+    """T_s [ns], such that all steps together last as long as the poses do: a median would drift away from the clock."""
     k: Steps
     """Step of each pose, shape (M,); 0 for the first."""
     deviations: Floats
@@ -280,7 +280,9 @@ def _sampling(stamps: Steps, where: str) -> Sampling:
             f"{where}: a gap of {gaps[i] / NS_PER_S:g} s after the stamp {stamps[i] / NS_PER_S:.9f} s is {steps[i]} "
             f"periods of {period / NS_PER_S:g} s; at most {MAX_LEAP} are believed: is it one recording, by one clock?"
         )
-    return Sampling(period, np.concatenate(([0], np.cumsum(steps))), gaps - steps * period)
+    k = np.concatenate(([0], np.cumsum(steps)))
+    mean = float(stamps[-1] - stamps[0]) / float(k[-1])
+    return Sampling(mean, k, gaps - steps * mean)
 
 
 def _period(gaps: Steps) -> float:
@@ -303,7 +305,7 @@ def _sampling_notes(sampling: Sampling, topic: str, ts: float | None) -> Iterato
     ms = 1e-6
     missing = int(sampling.k[-1]) + 1 - len(sampling.k)
     yield (
-        f"{topic}: sampling period {sampling.period * ms:g} ms, the median of the stamps; jitter "
+        f"{topic}: sampling period {sampling.period * ms:g} ms by the stamps; jitter "
         f"{np.std(sampling.deviations) * ms:.3g} ms, at most {np.abs(sampling.deviations).max() * ms:.3g} ms"
     )
     if missing:
