@@ -12,7 +12,7 @@ from agv_ros.stamps import NS_PER_S
 
 def check_times(topic: str, rows: NDArray[np.void], findings: Findings) -> None:
     """Report times that run backwards, messages that are there twice, and stamps that no clock can have shown."""
-    log_time = rows[LOG_TIME]
+    log_time = np.ascontiguousarray(rows[LOG_TIME])  # one pass over the rows instead of four
     steps = np.diff(log_time)
     _report(findings, f"{topic}: message logged before the one that it follows", steps < 0)
     _report(findings, f"{topic}: message that is there twice", _repeated(rows, log_time, steps))
