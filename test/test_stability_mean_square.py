@@ -175,15 +175,23 @@ def growth_per_reception(F: Floats, G: Floats, lengths: Floats) -> float:
     return float(np.abs(np.linalg.eigvals(total)).max())
 
 
-@pytest.mark.parametrize(("loss_rate", "kx", "v"), [(0.05, 5.0, 1.0), (0.3, 25.0, 1.0), (0.1, 10.0, 4.0)])
-def test_the_critical_burst_by_renewals(loss_rate: float, kx: float, v: float) -> None:
+def test_the_example_of_the_docs() -> None:
+    assert critical_burst(0.05, *straight(), gains(5.0), TS) == pytest.approx(346.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("loss_rate", "kx", "v", "w"),
+    [(0.05, 5.0, 1.0, 0.0), (0.3, 25.0, 1.0, 0.0), (0.1, 10.0, 4.0, 0.0), (0.1, 25.0, 1.0, 0.12)],
+)
+def test_the_critical_burst_by_renewals(loss_rate: float, kx: float, v: float, w: float) -> None:
     """Where bursts are long and rare the error across binds, because it grows with the square of their length."""
-    found = critical_burst(loss_rate, *straight(v), gains(kx), TS)
-    F, G = (matrices[0] for matrices in step_matrices(*straight(v), gains(kx), TS))
-    assert growth_per_reception(F, G, bursty(loss_rate, 0.99 * found).burst_lengths()) < 1.0
-    assert growth_per_reception(F, G, bursty(loss_rate, 1.01 * found).burst_lengths()) > 1.0
+    speeds = np.array([v]), np.array([w])
+    found = critical_burst(loss_rate, *speeds, gains(kx), TS)
+    F, G = (matrices[0] for matrices in step_matrices(*speeds, gains(kx), TS))
+    assert growth_per_reception(F, G, bursty(loss_rate, 0.999 * found).burst_lengths()) < 1.0
+    assert growth_per_reception(F, G, bursty(loss_rate, 1.001 * found).burst_lengths()) > 1.0
     along = found * loss_rate == pytest.approx(1.0 / (TS * kx) - 0.5, rel=1e-5)
-    assert along == ((kx, v) == (25.0, 1.0))
+    assert along == ((kx, v, w) == (25.0, 1.0, 0.0))
 
 
 def test_degenerate_cases() -> None:

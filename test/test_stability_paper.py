@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agv_analysis.scenario import load_scenario
+from agv_analysis.stability import almost_sure
 from agv_analysis.stability.paper import largest_n, matrices, spectral_radii
 from agv_cloud.control_law import control_law
 from agv_cloud.parameters import ControllerParameters
@@ -157,3 +158,29 @@ def test_a_loop_that_diverges_although_every_eigenvalue_is_inside() -> None:
         2.526e5, rel=1e-3
     )  # p(k+1) = p(k) + T_s [v_r + K_x (r(k) - p(k-13))]
     assert end_of_line(11, 4000, gains()) < 0.06  # it settles n T_s v_r = 0.055 m ahead
+
+
+# -- the table of the docs -------------------------------------------------------------------------------------------
+
+
+def rows_of_the_docs() -> list[list[str]]:
+    page = (Path(CONFIG).parents[1] / "docs/stability.md").read_text()
+    table = page[page.index("<!-- acceptance:begin -->") : page.index("<!-- acceptance:end -->")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[3:]]
+
+
+@pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
+def test_the_table_of_the_docs(track: str) -> None:
+    """What the other columns say is held by the tests of their criteria."""
+    reference = Reference(load_scenario(CONFIG, [f"error_detector.track={track}"]).error_detector).first(20_000)
+    theta, v, w = reference[:, 2], reference[:, 3], reference[:, 4]
+    rows = [row for row in rows_of_the_docs() if row[0] == track]
+    others = [["62", "78", "0.97531"], ["12", "14", "0.88235"], ["0", "0", "0.23077"]]
+    assert [[row[1], *row[3:6]] for row in rows] == [
+        [kx, *row] for kx, row in zip(("5", "25", "250"), others, strict=True)
+    ]
+    for _, kx, of_paper, *_, p_almost_surely in rows:
+        assert largest_n(theta, v, gains(float(kx)), TS) == (None if of_paper == "all" else int(of_paper))
+        if track in ("paper", "line"):
+            found = almost_sure.critical_loss(v, w, gains(float(kx)), TS)
+            assert found == pytest.approx(float(p_almost_surely), abs=2e-3)
