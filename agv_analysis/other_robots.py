@@ -43,6 +43,9 @@ REFERENCES = ("nav_msgs/msg/Path", "nav_msgs/msg/Odometry")
 _SAME_PERIOD = 0.01
 """Largest relative difference between the params file's period and the stamps' that goes without saying."""
 
+_REACH = 1.0
+"""How far [m] along a path, beyond what the AGV moves, the point nearest to it may move from one pose to the next."""
+
 
 class RobotTopics(NamedTuple):
     """Topics of a robot by what they mean; None: not in the recording."""
@@ -94,7 +97,7 @@ def read_robot_run(path: Path, topics: RobotTopics, track_file: Path | None = No
         raise UserError("no reference: name its topic with --reference-topic, or a track with --track-file or --config")
     bag = read_bag(path, topics=[name for name in topics if name is not None])
     poses = _poses(bag, topics.pose, POSES)
-    target = None if topics.reference is None else _target(bag, topics.reference)
+    target = None if topics.reference is None else _target(bag, topics.reference, poses)
     return _run(bag, topics, poses, target, _scenario(track_file, config), config)
 
 
@@ -217,7 +220,7 @@ def _poses(bag: Bag, topic: str, kinds: dict[str, str], what: str = "pose") -> T
         theta=_yaws(messages, path),
         v=messages["twist.twist.linear.x"] if is_odometry else nothing,
         w=messages["twist.twist.angular.z"] if is_odometry else nothing,
-        frame=messages["header.frame_id"][0].decode(errors="replace"),
+        frame=_frame(messages),
     )
     return _in_order(everything, f"{bag.path}: {topic}", topic)
 
@@ -274,11 +277,12 @@ def _sampling(stamps: Steps, where: str) -> Sampling:
     gaps = np.diff(stamps)
     period = _period(gaps)
     steps = np.maximum(1, np.rint(gaps / period)).astype(np.int64)
-    if steps.max() > MAX_LEAP:
+    if steps.max() > MAX_LEAP or steps.sum() > MAX_LEAP + 100 * len(stamps):
         i = int(np.argmax(steps))
         raise UserError(
             f"{where}: a gap of {gaps[i] / NS_PER_S:g} s after the stamp {stamps[i] / NS_PER_S:.9f} s is {steps[i]} "
-            f"periods of {period / NS_PER_S:g} s; at most {MAX_LEAP} are believed: is it one recording, by one clock?"
+            f"periods of {period / NS_PER_S:g} s, and only {len(stamps)} poses are there: is it "
+            "one recording, by one clock?"
         )
     k = np.concatenate(([0], np.cumsum(steps)))
     mean = float(stamps[-1] - stamps[0]) / float(k[-1])
@@ -319,41 +323,122 @@ def _sampling_notes(sampling: Sampling, topic: str, ts: float | None) -> Iterato
 # -- reference and command --------------------------------------------------------------------------------------------
 
 
-def _target(bag: Bag, topic: str) -> Track:
+def _target(bag: Bag, topic: str, poses: Track) -> Track:
     """The reference over time."""
     messages = _messages(bag, topic, REFERENCES, "reference")
     if bag.topics[topic].type == "nav_msgs/msg/Odometry":
         return _poses(bag, topic, POSES, "reference")
-    return _of_paths(messages, f"{bag.path}: {topic}", topic)
+    own = np.arange(messages["poses.pose.position.x"].shape[1]) < messages["len(poses)"][:, np.newaxis]
+    stamps, where = _stamps(messages, "poses.header"), f"{bag.path}: {topic}"
+    if any(len(np.unique(plan[there])) > 1 for plan, there in zip(stamps, own, strict=True)):
+        return _of_timed_paths(messages, stamps, own, where, topic)
+    return _of_paths_without_times(messages, own, poses, where, topic)
 
 
-def _of_paths(paths: NDArray[np.void], where: str, topic: str) -> Track:
+def _of_timed_paths(paths: NDArray[np.void], stamps: Steps, own: NDArray[np.bool_], where: str, topic: str) -> Track:
     """A plan is followed until the next one begins. Its speeds are differences, of each pose to the next one."""
-    lengths, stamps = paths["len(poses)"], _stamps(paths, "poses.header")
-    postures = (paths["poses.pose.position.x"], paths["poses.pose.position.y"], _yaws(paths, "poses.pose"))
-    own = np.arange(stamps.shape[1]) < lengths[:, np.newaxis]
-    begins = np.where(lengths > 0, np.where(own, stamps, np.iinfo(np.int64).max).min(axis=1, initial=2**62), 2**62)
-    ends = np.concatenate((np.minimum.accumulate(begins[::-1])[::-1][1:], [np.iinfo(np.int64).max]))
+    never = np.iinfo(np.int64).max
+    begins = np.where(own, stamps, never).min(axis=1, initial=never)
+    ends = np.append(np.minimum.accumulate(begins[::-1])[::-1][1:], never)
     followed = own & (stamps < ends[:, np.newaxis])
-    if np.count_nonzero(followed) < 2 or len(np.unique(stamps[followed])) < 2:
-        raise UserError(
-            f"{where}: the poses of its paths have no times of their own, so nobody knows where the AGV should be when:"
-            " record the reference as nav_msgs/Odometry, stamp the poses, or give the speeds with --track-file"
-        )
-    x, y, theta = (part[followed] for part in postures)
+    x, y = (paths[f"poses.pose.position.{axis}"][followed] for axis in "xy")
+    theta = _yaws(paths, "poses.pose")[followed]
     log_times = np.repeat(paths[LOG_TIME], np.count_nonzero(followed, axis=1))
-    still, frame = np.zeros(len(x)), paths["header.frame_id"][0].decode(errors="replace")
-    return _with_speeds(_in_order(Track(stamps[followed], log_times, x, y, theta, still, still, frame), where, topic))
+    still, frame = np.zeros(len(x)), _frame(paths)
+    track = _in_order(Track(stamps[followed], log_times, x, y, theta, still, still, frame), where, topic)
+    return _with_speeds(track)
+
+
+def _of_paths_without_times(
+    paths: NDArray[np.void], own: NDArray[np.bool_], poses: Track, where: str, topic: str
+) -> Track:
+    """Of the newest plan at each pose the point nearest to it: such a plan says where to drive, not when."""
+    lines = [
+        _line(*(plan[there] for plan in columns))
+        for *columns, there in zip(*(paths[f"poses.pose.position.{axis}"] for axis in "xy"), own, strict=True)
+    ]
+    begins = _stamps(paths)
+    if not begins.any():
+        begins = _by_the_clock_of(poses, paths[LOG_TIME])
+    usable = [i for i in np.argsort(begins, kind="stable").tolist() if len(lines[i].s) > 1]
+    newest = np.searchsorted(begins[usable], poses.stamps, side="right") - 1
+    chunks = [
+        _along(lines[i], poses.chosen(newest == number)) for number, i in enumerate(usable) if (newest == number).any()
+    ]
+    if not chunks:
+        raise UserError(f"{where}: no path of at least two finite points before the last pose")
+    joined = {
+        name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in ("x", "y", "theta", "v", "w")
+    }
+    seen = poses.chosen(newest >= 0)
+    note = (
+        f"{topic}: its poses have no times, so the reference is the point of the path nearest to the AGV, and errors "
+        "are those across the path"
+    )
+    return seen._replace(**joined, frame=_frame(paths), notes=(note,))
+
+
+class Line(NamedTuple):
+    """A polyline by arc length s [m]; theta is its heading [rad] at the vertices, counting turns; shapes (M,)."""
+
+    s: Floats
+    x: Floats
+    y: Floats
+    theta: Floats
+
+
+def _line(x: Floats, y: Floats) -> Line:
+    """Line through the finite points of a plan, those left out that repeat the one before."""
+    finite = np.isfinite(x + y)
+    x, y = x[finite], y[finite]
+    moves = np.hypot(np.diff(x, prepend=np.nan), np.diff(y, prepend=np.nan)) != 0.0
+    x, y = x[moves], y[moves]
+    if len(x) < 2:
+        return Line(np.zeros(len(x)), x, y, np.zeros(len(x)))
+    heading = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
+    theta = np.concatenate((heading[:1], (heading[1:] + heading[:-1]) / 2.0, heading[-1:]))
+    return Line(np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y))))), x, y, theta)
+
+
+def _along(line: Line, poses: Track) -> Track:
+    """The points of the line that go with the poses, and the speeds at which they move.
+
+    From one pose to the next the point stays near, so that where a track crosses itself it keeps to its branch.
+    """
+    s, low, high, before = np.empty(len(poses.x)), 0.0, float(line.s[-1]), (0.0, 0.0)
+    for i, (x, y) in enumerate(zip(poses.x.tolist(), poses.y.tolist(), strict=True)):
+        if i:
+            reach = _REACH + 3.0 * float(np.hypot(x - before[0], y - before[1]))
+            low, high = s[i - 1] - reach, s[i - 1] + reach
+        s[i], before = _nearest(line, x, y, low, high), (x, y)
+    x_r, y_r, theta = (np.interp(s, line.s, column) for column in (line.x, line.y, line.theta))
+    return _with_speeds(poses._replace(x=x_r, y=y_r, theta=theta))
+
+
+def _nearest(line: Line, x: float, y: float, low: float, high: float) -> float:
+    """Arc length [m] of the point of a line nearest to (x, y), on the segments between arc lengths `low` and `high`."""
+    first = max(0, int(np.searchsorted(line.s, low, side="right")) - 1)
+    last = min(len(line.s) - 1, max(first + 1, int(np.searchsorted(line.s, high))))
+    first = min(first, last - 1)
+    px, py, s = line.x[first : last + 1], line.y[first : last + 1], line.s[first : last + 1]
+    dx, dy, length = np.diff(px), np.diff(py), np.diff(s)
+    share = np.clip(((x - px[:-1]) * dx + (y - py[:-1]) * dy) / length**2, 0.0, 1.0)
+    i = int(np.argmin(np.hypot(px[:-1] + share * dx - x, py[:-1] + share * dy - y)))
+    return float(s[i] + share[i] * length[i])
+
+
+def _frame(messages: NDArray[np.void]) -> str:
+    return str(messages["header.frame_id"][0].decode(errors="replace"))
 
 
 def _with_speeds(track: Track) -> Track:
     """Speed along the heading and rate of turn [m/s, rad/s] from each pose to the next, of the last as before it."""
+    if len(track.x) < 2:
+        return track._replace(v=np.zeros(len(track.x)), w=np.zeros(len(track.x)))
     dt = np.diff(track.stamps) / NS_PER_S
     cos, sin = np.cos(track.theta[:-1]), np.sin(track.theta[:-1])
-    v = (np.diff(track.x) * cos + np.diff(track.y) * sin) / dt
-    return track._replace(
-        v=np.append(v, v[-1:]), w=np.append(np.diff(track.theta) / dt, np.diff(track.theta)[-1:] / dt[-1:])
-    )
+    v, w = (np.diff(track.x) * cos + np.diff(track.y) * sin) / dt, np.diff(track.theta) / dt
+    return track._replace(v=np.append(v, v[-1]), w=np.append(w, w[-1]))
 
 
 def _covered(poses: Track, target: Track, bag: Bag, topics: RobotTopics) -> Track:

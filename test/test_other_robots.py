@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -201,6 +203,60 @@ def test_a_plan_is_followed_until_the_next_one_begins(tmp_path: Path, truth: Run
     assert_is_the_truth(read_robot_run(made.write(tmp_path / "bag"), ALL), truth)
 
 
+def driven(poses: Any, *plans: tuple[int, Any]) -> Recording:
+    """Poses (x, y, theta) one period apart, and plans (step, points) whose poses have no times."""
+    made = Recording()
+    for k, pose in enumerate(poses):
+        made.add("/odom", START + k * TS + LOG, odometry(START + k * TS, posture(*pose)))
+    for k, points in plans:
+        places = [stamped(0, posture(x, y, 0.0)) for x, y in points]
+        made.add("/plan", START + k * TS + LOG, make("nav_msgs/msg/Path", header=header(START + k * TS), poses=places))
+    return made
+
+
+def test_of_a_plan_without_times_the_nearest_point_counts(tmp_path: Path) -> None:
+    x = np.linspace(0.5, 8.5, 401)  # 1 m/s
+    poses = np.column_stack([x, 0.3 * np.cos(x), np.zeros(401)])
+    made = driven(poses, (0, [(0.0, 0.0), (0.0, 0.0), (4.0, 0.0), (10.0, 0.0)]), (300, [(0.0, 1.0), (10.0, 1.0)]))
+    run = read_robot_run(made.write(tmp_path / "bag"), RobotTopics("/odom", None, "/plan"))
+    y = np.where(np.arange(401) < 300, 0.0, 1.0)
+    np.testing.assert_allclose(run.reference[:, :3], np.column_stack([x, y, np.zeros(401)]), atol=1e-12)
+    np.testing.assert_allclose(run.reference[:, 3:], np.tile([1.0, 0.0], (401, 1)), atol=1e-9)
+    assert any("errors are those across the path" in note for note in run.notes)
+
+
+def test_where_a_path_crosses_itself_the_nearest_point_keeps_to_its_branch(tmp_path: Path) -> None:
+    t = np.linspace(0.0, 2.0 * np.pi, 1001)
+    poses = np.column_stack(
+        [5.0 * np.sin(t), 2.5 * np.sin(2.0 * t), np.arctan2(5.0 * np.cos(2.0 * t), 5.0 * np.cos(t))]
+    )
+    run = read_robot_run(
+        driven(poses, (0, poses[::5, :2])).write(tmp_path / "bag"), RobotTopics("/odom", None, "/plan")
+    )
+    np.testing.assert_allclose(run.reference[:, :2], poses[:, :2], atol=0.01)
+    np.testing.assert_allclose(wrapped(run.reference[:, 2] - poses[:, 2]), 0.0, atol=0.03)
+
+
+@settings(deadline=None, derandomize=True, max_examples=15)
+@given(lost=st.lists(st.booleans(), min_size=30, max_size=120), seed=st.integers(0, 2**32 - 1))
+def test_every_loss_is_found_from_the_stamps(
+    tmp_path_factory: pytest.TempPathFactory, lost: list[bool], seed: int
+) -> None:
+    """With up to half of the poses lost, and stamps that are up to a tenth of a period early or late."""
+    kept = [k for k in range(len(lost)) if not lost[k] or k % 4 < 2]
+    jitter = np.random.default_rng(seed).integers(-TS // 10, TS // 10, len(lost), endpoint=True)
+    made = Recording()
+    for k in kept:
+        stamp = START + k * TS + int(jitter[k])
+        made.add("/odom", stamp + LOG, odometry(stamp, posture(0.1 * k, 0.0, 0.0)))
+    plan = [stamped(0, posture(x, 0.0, 0.0)) for x in (0.0, 100.0)]
+    made.add("/plan", START, make("nav_msgs/msg/Path", header=header(START - 10 * TS), poses=plan))
+    bag = made.write(tmp_path_factory.mktemp("jitter") / "bag")
+    run = read_robot_run(bag, RobotTopics("/odom", None, "/plan"))
+    assert np.flatnonzero(~run.lost).tolist() == [k - kept[0] for k in kept]
+    assert run.ts == pytest.approx(TS * 1e-9, rel=0.2 / (len(run) - 1) + 1e-9)
+
+
 def track_file(path: Path, truth: Run) -> Path:
     rows = [f"{k * truth.ts!r},{v!r},{w!r}" for k, (v, w) in enumerate(truth.reference[:, 3:].tolist())]
     path.write_text("\n".join(["t,v,w", *rows]) + "\n")
@@ -265,13 +321,15 @@ def test_with_gains_the_verdict_is_that_of_the_simulated_run(tmp_path: Path, tru
 
 def test_what_does_not_fit_is_said(tmp_path: Path, truth: Run) -> None:
     made = recording(truth, reference="none")
-    made.add("/plan", START, path_of(truth, range(50), times=False))
+    made.add("/plan", START, path_of(truth, range(1), times=False))
     made.add("/map_plan", START, odometry(START, posture(0, 0, 0), frame="map"))
     made.add("/map_plan", START + 1, odometry(START + 100 * TS, posture(0, 0, 0), frame="map"))
+    made.add("/empty", START, path_of(truth, range(0)))
     made.add("/early", START, odometry(1, posture(0, 0, 0)))
     bag = made.write(tmp_path / "bag")
     for topics, message in (
-        (ALL, "no times of their own"),
+        (ALL, "no path of at least two finite points"),
+        (ALL._replace(reference="/empty"), "no path of at least two finite points"),
         (ALL._replace(reference="/early"), "no instant in common"),
         (ALL._replace(pose="/nothing"), "no topic /nothing for the pose; it has .*/odom"),
         (ALL._replace(pose="/chatter"), "is of type std_msgs/msg/String; a pose must be one of"),
@@ -290,7 +348,7 @@ def test_a_wild_stamp_asks_for_no_memory(tmp_path: Path, truth: Run) -> None:
     made = recording(truth, reference="odometry")
     made.add("/odom", START + LOG + 10**12, odometry(START + 4 * 10**8 * 10**9, posture(0, 0, 0)))
     made.add("/plan", START + LOG + 10**12, odometry(START + 4 * 10**8 * 10**9, posture(0, 0, 0)))
-    with pytest.raises(UserError, match=r"a gap of .* at most 1000000 are believed"):
+    with pytest.raises(UserError, match=r"a gap of .* s is \d+ periods of 0.02 s, .* by one clock"):
         read_robot_run(made.write(tmp_path / "bag"), ALL)
 
 
