@@ -19,7 +19,7 @@ from agv_analysis.reproduce import outdated
 from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Finding, check
 from agv_analysis.reproduce.claims import CLAIMS, ON_TRACK
 from agv_analysis.reproduce.figures import figures, write
-from agv_analysis.reproduce.future import _across
+from agv_analysis.reproduce.future import settling_across
 from agv_analysis.reproduce.report import text_of
 from agv_analysis.reproduce.runs import GAINS, gain, recorded, scenario, simulated
 from agv_analysis.scenario import Scenario, load_scenario
@@ -292,7 +292,7 @@ def test_settling_across_is_that_of_the_linear_error(ky: float, ktheta: float) -
         if abs(y) >= 0.01 or abs(theta) >= 0.01:
             last = k
         y, theta = y + TS * v * theta, theta - TS * v * (ky * y + ktheta * theta)
-    steps = _across(ky, ktheta, (0.05, 0.0, 0.5 * math.pi))
+    steps = settling_across(ky, ktheta, (0.05, 0.0, 0.5 * math.pi))
     assert steps is not None
     assert abs(steps - (last + 1)) <= 3
 

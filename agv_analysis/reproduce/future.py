@@ -75,7 +75,9 @@ def _gains_across(name: str, offset: tuple[float, float, float]) -> list[Values]
     start = [value + moved for value, moved in zip((0.0, 0.0, 0.5 * math.pi), offset, strict=True)]
     rows: list[Values] = []
     for ktheta in (2.0, 4.0, 8.0):
-        tried = {share: _across(share * ktheta**2, ktheta, start) for share in np.arange(0.05, 1.01, 0.05).tolist()}
+        tried = {
+            share: settling_across(share * ktheta**2, ktheta, start) for share in np.arange(0.05, 1.01, 0.05).tolist()
+        }
         best = min(tried, key=lambda share: _never_last(tried[share]))
         rows.append({
             "error": name,
@@ -91,7 +93,7 @@ def _never_last(steps: int | None) -> float:
     return math.inf if steps is None else steps
 
 
-def _across(ky: float, ktheta: float, start: Sequence[float]) -> int | None:
+def settling_across(ky: float, ktheta: float, start: Sequence[float]) -> int | None:
     """First step from which on |y_e| stays below 1 cm and |theta_e| below 0.01 rad."""
     gains = (f"controller.ky={ky}", f"controller.ktheta={ktheta}")
     found = convergence(simulate(scenario(*gains, f"plant.initial_pose={list(start)}", "plant.duration=15.0")))
