@@ -37,7 +37,7 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     Parameters come from `config`, a params file, or from the bag itself. `namespace` chooses one of several loops.
     Raises UserError if the bag cannot be read, holds no loop, or nobody says what its parameters were.
     """
-    bag = read_bag(path)
+    bag = read_bag(path, topics=())
     names = _loop_topics(bag, path, namespace)
     scenario = _scenario(bag, path, config)
     bag = read_bag(path, topics=tuple(names.values()))
