@@ -13,38 +13,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.outages import ages
+from agv_analysis.plans import read_reference
+from agv_analysis.posture_track import Steps, Track, by_the_clock_of, messages_of, read_poses, stamps_of
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.ros_yaml import RosYamlError, load
 from agv_ros.stamps import MAX_LEAP, NS_PER_S
-from agv_ros.wire import yaw_of_quaternion
-
-Steps = NDArray[np.int64]
-
-POSES = {
-    "geometry_msgs/msg/PoseStamped": "pose",
-    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
-    "nav_msgs/msg/Odometry": "pose.pose",
-}
-"""Types of a pose, each with the path of the geometry_msgs/Pose in it."""
 
 COMMANDS = {"geometry_msgs/msg/Twist": "", "geometry_msgs/msg/TwistStamped": "twist."}
 """Types of a command, each with what stands before the path of a speed in it."""
 
-REFERENCES = ("nav_msgs/msg/Path", "nav_msgs/msg/Odometry")
-
 _SAME_PERIOD = 0.01
 """Largest relative difference between the params file's period and the stamps' that goes without saying."""
-
-_REACH = 1.0
-"""How far [m] along a path, beyond what the AGV moves, the point nearest to it may move from one pose to the next."""
 
 
 class RobotTopics(NamedTuple):
@@ -96,8 +82,8 @@ def read_robot_run(path: Path, topics: RobotTopics, track_file: Path | None = No
     if topics.reference is None and track_file is None and config is None:
         raise UserError("no reference: name its topic with --reference-topic, or a track with --track-file or --config")
     bag = read_bag(path, topics=[name for name in topics if name is not None])
-    poses = _poses(bag, topics.pose, POSES)
-    target = None if topics.reference is None else _target(bag, topics.reference, poses)
+    poses = read_poses(bag, topics.pose)
+    target = None if topics.reference is None else read_reference(bag, topics.reference, poses)
     return _run(bag, topics, poses, target, _scenario(track_file, config), config)
 
 
@@ -156,101 +142,6 @@ def _fitted(scenario: Scenario, period: float, came: Track, has_track_start: boo
         ),
         controller=dataclasses.replace(scenario.controller, **shared),
     )
-
-
-# -- poses over time --------------------------------------------------------------------------------------------------
-
-
-class Track(NamedTuple):
-    """Postures and speeds over time, arrays of shape (M,); stamps [ns] increase, theta counts turns."""
-
-    stamps: Steps
-    log_times: Steps
-    x: Floats
-    y: Floats
-    theta: Floats
-    v: Floats
-    w: Floats
-    frame: str
-    notes: tuple[str, ...] = ()
-
-    def at(self, stamps: Steps) -> Floats:
-        """x, y, theta, v, w at the instants `stamps` [ns], linear in between; shape (N, 5)."""
-        own, wanted = self.stamps - self.stamps[0], stamps - self.stamps[0]
-        columns = (self.x, self.y, self.theta, self.v, self.w)
-        return np.column_stack([np.interp(wanted, own, column) for column in columns])
-
-    def chosen(self, rows: NDArray[np.bool_]) -> Track:
-        """Those rows only."""
-        columns: dict[str, Any] = {
-            name: part[rows] for name, part in self._asdict().items() if isinstance(part, np.ndarray)
-        }
-        return self._replace(**columns)
-
-
-def _messages(bag: Bag, topic: str, kinds: tuple[str, ...], what: str) -> NDArray[np.void]:
-    """Messages of a topic. Raises UserError if it is not there, empty, or of no type that `what` may have."""
-    if topic not in bag.topics:
-        there = ", ".join(sorted(bag.topics)) or "none at all"
-        raise UserError(f"{bag.path}: no topic {topic} for the {what}; it has {there}")
-    kind = bag.topics[topic].type
-    if kind not in kinds:
-        raise UserError(f"{bag.path}: {topic} is of type {kind}; a {what} must be one of {', '.join(kinds)}")
-    messages = bag[topic]
-    if not len(messages):
-        raise UserError(f"{bag.path}: {topic} has no message, so there is no {what}")
-    return messages
-
-
-def _stamps(messages: NDArray[np.void], header: str = "header") -> Steps:
-    seconds = messages[f"{header}.stamp.sec"].astype(np.int64)
-    return np.asarray(seconds * NS_PER_S + messages[f"{header}.stamp.nanosec"])
-
-
-def _poses(bag: Bag, topic: str, kinds: dict[str, str], what: str = "pose") -> Track:
-    messages = _messages(bag, topic, tuple(kinds), what)
-    path = kinds[bag.topics[topic].type]
-    is_odometry = "twist.twist.linear.x" in (messages.dtype.names or ())
-    nothing = np.zeros(len(messages))
-    everything = Track(
-        stamps=_stamps(messages),
-        log_times=messages[LOG_TIME],
-        x=messages[f"{path}.position.x"],
-        y=messages[f"{path}.position.y"],
-        theta=_yaws(messages, path),
-        v=messages["twist.twist.linear.x"] if is_odometry else nothing,
-        w=messages["twist.twist.angular.z"] if is_odometry else nothing,
-        frame=_frame(messages),
-    )
-    return _in_order(everything, f"{bag.path}: {topic}", topic)
-
-
-def _yaws(messages: NDArray[np.void], path: str) -> Floats:
-    """Yaw [rad] in (-pi, pi]; NaN where the quaternion is zero and says nothing. Shape as that of the components."""
-    components = [messages[f"{path}.orientation.{axis}"] for axis in "xyzw"]
-    yaws = [yaw_of_quaternion(*q) for q in zip(*(part.ravel().tolist() for part in components), strict=True)]
-    said = np.any(components, axis=0)
-    return np.where(said, np.reshape(yaws, said.shape), np.nan)
-
-
-def _in_order(track: Track, where: str, topic: str) -> Track:
-    """Only finite postures, each with a stamp later than all before it: an edge ignores what is older than it holds."""
-    finite = np.isfinite(track.x + track.y + track.theta + track.v + track.w)
-    usable = track.chosen(finite)
-    if not len(usable.stamps):
-        raise UserError(f"{where}: none of its {len(finite)} poses has finite numbers and an orientation")
-    newest = np.maximum.accumulate(usable.stamps)
-    later = np.concatenate(([True], usable.stamps[1:] > newest[:-1]))
-    repeated = np.count_nonzero(usable.stamps[1:] == newest[:-1])
-    backwards = len(later) - np.count_nonzero(later) - repeated
-    counts = (
-        (len(finite) - np.count_nonzero(finite), "poses are not finite or have no orientation"),
-        (repeated, "stamps repeat the one before"),
-        (backwards, "stamps go backwards"),
-    )
-    notes = tuple(f"{topic}: {count} {what}, their messages are left out" for count, what in counts if count)
-    kept = usable.chosen(later)
-    return kept._replace(theta=np.unwrap(kept.theta), notes=notes)
 
 
 # -- the sampling period ----------------------------------------------------------------------------------------------
@@ -323,124 +214,6 @@ def _sampling_notes(sampling: Sampling, topic: str, ts: float | None) -> Iterato
 # -- reference and command --------------------------------------------------------------------------------------------
 
 
-def _target(bag: Bag, topic: str, poses: Track) -> Track:
-    """The reference over time."""
-    messages = _messages(bag, topic, REFERENCES, "reference")
-    if bag.topics[topic].type == "nav_msgs/msg/Odometry":
-        return _poses(bag, topic, POSES, "reference")
-    own = np.arange(messages["poses.pose.position.x"].shape[1]) < messages["len(poses)"][:, np.newaxis]
-    stamps, where = _stamps(messages, "poses.header"), f"{bag.path}: {topic}"
-    if any(len(np.unique(plan[there])) > 1 for plan, there in zip(stamps, own, strict=True)):
-        return _of_timed_paths(messages, stamps, own, where, topic)
-    return _of_paths_without_times(messages, own, poses, where, topic)
-
-
-def _of_timed_paths(paths: NDArray[np.void], stamps: Steps, own: NDArray[np.bool_], where: str, topic: str) -> Track:
-    """A plan is followed until the next one begins. Its speeds are differences, of each pose to the next one."""
-    never = np.iinfo(np.int64).max
-    begins = np.where(own, stamps, never).min(axis=1, initial=never)
-    ends = np.append(np.minimum.accumulate(begins[::-1])[::-1][1:], never)
-    followed = own & (stamps < ends[:, np.newaxis])
-    x, y = (paths[f"poses.pose.position.{axis}"][followed] for axis in "xy")
-    theta = _yaws(paths, "poses.pose")[followed]
-    log_times = np.repeat(paths[LOG_TIME], np.count_nonzero(followed, axis=1))
-    still, frame = np.zeros(len(x)), _frame(paths)
-    track = _in_order(Track(stamps[followed], log_times, x, y, theta, still, still, frame), where, topic)
-    return _with_speeds(track)
-
-
-def _of_paths_without_times(
-    paths: NDArray[np.void], own: NDArray[np.bool_], poses: Track, where: str, topic: str
-) -> Track:
-    """Of the newest plan at each pose the point nearest to it: such a plan says where to drive, not when."""
-    lines = [
-        _line(*(plan[there] for plan in columns))
-        for *columns, there in zip(*(paths[f"poses.pose.position.{axis}"] for axis in "xy"), own, strict=True)
-    ]
-    begins = _stamps(paths)
-    if not begins.any():
-        begins = _by_the_clock_of(poses, paths[LOG_TIME])
-    usable = [i for i in np.argsort(begins, kind="stable").tolist() if len(lines[i].s) > 1]
-    newest = np.searchsorted(begins[usable], poses.stamps, side="right") - 1
-    chunks = [
-        _along(lines[i], poses.chosen(newest == number)) for number, i in enumerate(usable) if (newest == number).any()
-    ]
-    if not chunks:
-        raise UserError(f"{where}: no path of at least two finite points before the last pose")
-    joined = {
-        name: np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in ("x", "y", "theta", "v", "w")
-    }
-    seen = poses.chosen(newest >= 0)
-    note = (
-        f"{topic}: its poses have no times, so the reference is the point of the path nearest to the AGV, and errors "
-        "are those across the path"
-    )
-    return seen._replace(**joined, frame=_frame(paths), notes=(note,))
-
-
-class Line(NamedTuple):
-    """A polyline by arc length s [m]; theta is its heading [rad] at the vertices, counting turns; shapes (M,)."""
-
-    s: Floats
-    x: Floats
-    y: Floats
-    theta: Floats
-
-
-def _line(x: Floats, y: Floats) -> Line:
-    """Line through the finite points of a plan, those left out that repeat the one before."""
-    finite = np.isfinite(x + y)
-    x, y = x[finite], y[finite]
-    moves = np.hypot(np.diff(x, prepend=np.nan), np.diff(y, prepend=np.nan)) != 0.0
-    x, y = x[moves], y[moves]
-    if len(x) < 2:
-        return Line(np.zeros(len(x)), x, y, np.zeros(len(x)))
-    heading = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
-    theta = np.concatenate((heading[:1], (heading[1:] + heading[:-1]) / 2.0, heading[-1:]))
-    return Line(np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y))))), x, y, theta)
-
-
-def _along(line: Line, poses: Track) -> Track:
-    """The points of the line that go with the poses, and the speeds at which they move.
-
-    From one pose to the next the point stays near, so that where a track crosses itself it keeps to its branch.
-    """
-    s, low, high, before = np.empty(len(poses.x)), 0.0, float(line.s[-1]), (0.0, 0.0)
-    for i, (x, y) in enumerate(zip(poses.x.tolist(), poses.y.tolist(), strict=True)):
-        if i:
-            reach = _REACH + 3.0 * float(np.hypot(x - before[0], y - before[1]))
-            low, high = s[i - 1] - reach, s[i - 1] + reach
-        s[i], before = _nearest(line, x, y, low, high), (x, y)
-    x_r, y_r, theta = (np.interp(s, line.s, column) for column in (line.x, line.y, line.theta))
-    return _with_speeds(poses._replace(x=x_r, y=y_r, theta=theta))
-
-
-def _nearest(line: Line, x: float, y: float, low: float, high: float) -> float:
-    """Arc length [m] of the point of a line nearest to (x, y), on the segments between arc lengths `low` and `high`."""
-    first = max(0, int(np.searchsorted(line.s, low, side="right")) - 1)
-    last = min(len(line.s) - 1, max(first + 1, int(np.searchsorted(line.s, high))))
-    first = min(first, last - 1)
-    px, py, s = line.x[first : last + 1], line.y[first : last + 1], line.s[first : last + 1]
-    dx, dy, length = np.diff(px), np.diff(py), np.diff(s)
-    share = np.clip(((x - px[:-1]) * dx + (y - py[:-1]) * dy) / length**2, 0.0, 1.0)
-    i = int(np.argmin(np.hypot(px[:-1] + share * dx - x, py[:-1] + share * dy - y)))
-    return float(s[i] + share[i] * length[i])
-
-
-def _frame(messages: NDArray[np.void]) -> str:
-    return str(messages["header.frame_id"][0].decode(errors="replace"))
-
-
-def _with_speeds(track: Track) -> Track:
-    """Speed along the heading and rate of turn [m/s, rad/s] from each pose to the next, of the last as before it."""
-    if len(track.x) < 2:
-        return track._replace(v=np.zeros(len(track.x)), w=np.zeros(len(track.x)))
-    dt = np.diff(track.stamps) / NS_PER_S
-    cos, sin = np.cos(track.theta[:-1]), np.sin(track.theta[:-1])
-    v, w = (np.diff(track.x) * cos + np.diff(track.y) * sin) / dt, np.diff(track.theta) / dt
-    return track._replace(v=np.append(v, v[-1]), w=np.append(w, w[-1]))
-
-
 def _covered(poses: Track, target: Track, bag: Bag, topics: RobotTopics) -> Track:
     """The poses from the beginning of the reference to its end: outside there is nothing to compare them with."""
     covered = poses.chosen((poses.stamps >= target.stamps[0]) & (poses.stamps <= target.stamps[-1]))
@@ -480,11 +253,11 @@ def _commands(bag: Bag, topic: str | None, came: Track, stamps: Steps, period: f
     command = np.full((len(stamps), 2), np.nan)
     if topic is None:
         return command, ("no command: nothing is said of its damping",)
-    messages = _messages(bag, topic, tuple(COMMANDS), "command")
+    messages = messages_of(bag, topic, tuple(COMMANDS), "command")
     prefix = COMMANDS[bag.topics[topic].type]
-    instants = _stamps(messages) if prefix else np.zeros(len(messages), dtype=np.int64)
+    instants = stamps_of(messages) if prefix else np.zeros(len(messages), dtype=np.int64)
     if not instants.any():
-        instants = _by_the_clock_of(came, messages[LOG_TIME])
+        instants = by_the_clock_of(came, messages[LOG_TIME])
     order = np.argsort(instants, kind="stable")
     ends = np.append(stamps[1:], stamps[-1] + round(period))
     newest = np.searchsorted(instants[order], ends, side="left") - 1
@@ -495,12 +268,3 @@ def _commands(bag: Bag, topic: str | None, came: Track, stamps: Steps, period: f
     return command, (
         f"{topic}: no command came in {held} of {len(stamps)} steps, the last one is held",
     ) if held else ()
-
-
-def _by_the_clock_of(came: Track, log_times: Steps) -> Steps:
-    """Instants on the clock of the poses' stamps for messages of which only the log time is known."""
-    logged = np.maximum.accumulate(came.log_times)
-    first = logged[0]
-    since = np.interp(log_times - first, logged - first, came.stamps - came.stamps[0])
-    instants = np.rint(since).astype(np.int64) + came.stamps[0]
-    return np.asarray(np.where(log_times < first, came.stamps[0] - (first - log_times), instants))

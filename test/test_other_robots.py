@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from agv_analysis.analysis import analyse, observe
 from agv_analysis.convergence import wrapped
 from agv_analysis.other_robots import RobotTopics, read_robot_run, read_topics
+from agv_analysis.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
@@ -171,6 +172,17 @@ def test_the_run_comes_back_whatever_the_types(
     assert run.ts == pytest.approx(0.02, abs=1e-15)
     assert not run.gains_known
     assert_is_the_truth(run, truth)
+
+
+def test_our_own_recording_tells_the_same_without_its_slots(tmp_path: Path) -> None:
+    """What arrived at the edge, and when, is enough for the outages; the slots, which say them, are not read."""
+    expected, config = read_run(REPOSITORY / "bags/sample"), tmp_path / "params.yaml"
+    config.write_text(expected.scenario.to_yaml())
+    topics = RobotTopics("/edge/pose", "/edge/cmd_vel")
+    run = read_robot_run(REPOSITORY / "bags/sample", topics, None, config)
+    for name in ("k", "lost", "n_ul", "command", "reference"):
+        np.testing.assert_array_equal(getattr(run, name), getattr(expected, name)[: len(run)])
+    np.testing.assert_allclose(run.pose[~run.lost], expected.pose[~run.lost], rtol=0.0, atol=1e-12)
 
 
 def test_lost_poses_lie_between_those_that_came(tmp_path: Path, truth: Run) -> None:
