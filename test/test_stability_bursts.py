@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.bursts import (
@@ -80,6 +82,20 @@ def separation(track: str, kx: float, n: int, steps: int) -> float:
 def test_runs_on_both_sides_of_the_border(track: str, kx: float, stable: int, unstable: int) -> None:
     assert separation(track, kx, stable, 6000) < 1e-3
     assert separation(track, kx, unstable, 4000) > 1e2
+
+
+@pytest.mark.parametrize("n", [13, 18])
+def test_recorded_runs_of_the_nodes_on_both_sides_of_the_border(drive: Callable[..., Run], n: int) -> None:
+    """K_x = 25, from 5 m ahead, 4 s: along a line each burst multiplies the error by 1 - (n + 1) / 8."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    setting = ["error_detector.track=line", "plant.duration=4.0", "relay.uplink.model=burst", f"relay.uplink.n={n}"]
+    run = drive(*setting)
+    assert run.n_ul.max() == n
+    received = run.pose[run.n_ul == 0, 1] - run.reference[run.n_ul == 0, 1]
+    settled = TS * n / 2.0  # p -> p + L T_s v_r + a sum of (r(k) - p) over the burst: ahead by the mean of its ages
+    ratios = np.diff(received[:20] - settled)[1:] / np.diff(received[:20] - settled)[:-1]
+    np.testing.assert_allclose(ratios, 1.0 - 0.125 * (n + 1), atol=1e-3)
+    assert abs(received[-1]) < 0.1 if n == 13 else abs(received[-1]) > 100.0
 
 
 @pytest.mark.parametrize(("n", "amplitude"), [(14, 0.0), (16, 0.24), (20, 0.37)])
@@ -195,6 +211,23 @@ def test_speeds_that_change_inside_a_burst() -> None:
             size = np.abs(product).max()
             product, log_scale = product / size, log_scale + math.log(size)
         assert math.exp(log_scale / k) <= found.upper + 2e-3
+
+
+@pytest.mark.parametrize("n", [0, 2, 6, 9])
+def test_the_lower_bound_drives_laps_whose_last_burst_is_cut_short(n: int) -> None:
+    """Seven steps a lap: bursts of L steps from its first, the rest of 7 / L at its end."""
+    random = np.random.default_rng(3)
+    v_r, w_r, by = random.uniform(0.0, 20.0, 7), random.uniform(-9.0, 9.0, 7), gains(80.0, 4.0, 3.0)
+    F, G = step_matrices(v_r, w_r, by, TS)
+    radii = []
+    for length in range(1, n + 2):
+        lap_map = np.eye(3)
+        for first in range(0, 7, length):
+            lap_map = burst_map(F, G, first, min(length, 7 - first)) @ lap_map
+        radii.append(float(np.abs(np.linalg.eigvals(lap_map)).max()) ** (1.0 / 7.0))
+    found = verdict(n, v_r, w_r, by, TS)
+    assert found.lower == pytest.approx(max(radii), rel=1e-9)
+    assert found.worst == int(np.argmax(radii))
 
 
 @pytest.mark.parametrize("n", [16, 20])
