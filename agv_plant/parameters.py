@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 from agv_plant.channels import MODELS
+from agv_plant.channels.trace import ENDS
 from agv_plant.unicycle import STEPS
-from agv_ros.parameters import LoopParameters, group, parameter
+from agv_ros.parameters import LoopParameters, ParameterError, group, parameter
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class PlantParameters(LoopParameters):
 class ChannelParameters:
     """One direction of the radio channel."""
 
-    model: str = parameter("perfect", "channel model", choices=tuple(MODELS))
+    model: str = parameter("perfect", "channel model", choices=(*MODELS, "trace"))
     p: float = parameter(
         0.0, "bernoulli: loss probability; gilbert_elliott: probability of good to bad, per slot", low=0.0, high=1.0,
         runtime=True,
@@ -56,6 +57,19 @@ class ChannelParameters:
         -1, "burst: the one step from which n slots are lost; -1: n are lost after each received one", low=-1,
         high=2**62, runtime=True,
     )  # fmt: skip
+    trace_file: str = parameter(
+        "", "trace: CSV file with a row a slot, column lost (0, 1) or verdict (delivered, lost)"
+    )
+    trace_end: str = parameter(
+        "repeat",
+        "trace: what follows its last slot; repeat: the first, hold: no more losses, stop: an error",
+        choices=ENDS,
+    )
+
+    def __post_init__(self) -> None:
+        """Check what no single bound can say."""
+        if self.model == "trace" and not self.trace_file:
+            raise ParameterError("a channel's model is trace, but its trace_file is empty: name a file")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_plant.channels import GOOD, MODELS
+from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import uniforms
 from agv_ros.stamps import Grid, Steps
@@ -21,12 +22,14 @@ class Channel:
 
     The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot
     0, so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
+    A measured channel's file is read here, once. Raises TraceError if it cannot be used.
     """
 
     def __init__(self, parameters: ChannelParameters, seed: int, stream: str) -> None:
         self.parameters = parameters
         self._seed = seed
         self._stream = stream
+        self._trace = load_trace(parameters.trace_file) if parameters.model == "trace" else ()
         self._next = 0
         self._state = GOOD
         self._last = False
@@ -35,6 +38,8 @@ class Channel:
 
     def lost(self, k: int) -> bool:
         """Is the message of slot `k` lost? Slot 0 never is: a run begins with the AGV known to the edge."""
+        if self._trace:
+            return k > 0 and self._measured(k)
         if k < self._next - 1:
             self._next, self._state = 0, GOOD
         model = MODELS[self.parameters.model]
@@ -43,6 +48,12 @@ class Channel:
             self._last = lost and self._next > 0
             self._next += 1
         return self._last
+
+    def _measured(self, k: int) -> bool:
+        try:
+            return trace(k, self._trace, self.parameters.trace_end)
+        except TraceError as error:
+            raise TraceError(f"{self.parameters.trace_file}: {error}") from None
 
     def _uniforms(self, k: int) -> Sequence[float]:
         first = k - k % _BLOCK

@@ -24,6 +24,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from agv_ros.errors import UserError
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid, to_nanoseconds
 from agv_ros.wire import InvalidMessageError, encode_diagnostics, stamp_of
@@ -109,6 +110,8 @@ class LoopNode(Node, Generic[P]):
         def receive(data: bytes) -> None:
             try:
                 callback(data)
+            except UserError:  # nothing that another message could mend
+                raise
             except ValueError as error:  # InvalidMessageError, OffGridError
                 self.reject(topic, data, error)
 

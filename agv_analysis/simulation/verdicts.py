@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from agv_analysis.simulation.compiled import compiled, numbers
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.parameters import ChannelParameters
+from agv_plant.radio import losses
 from agv_plant.random_stream import uniforms
 
 Verdicts = NDArray[np.bool_]
@@ -31,6 +32,7 @@ class Air:
 
     def __init__(self, seed: int, steps: int) -> None:
         self._steps = steps
+        self._seed = seed
         self._uniforms = functools.cache(lambda stream: uniforms(seed, stream, 0, steps))
         self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
 
@@ -39,6 +41,8 @@ class Air:
         return self._verdicts(channel, stream)
 
     def _judge(self, channel: ChannelParameters, stream: str) -> Verdicts:
+        if channel.model == "trace":  # nothing to compute
+            return losses(channel, self._seed, stream, self._steps)
         lost = np.zeros(self._steps, dtype=np.bool_)
         if channel.model != "perfect":  # which needs no random numbers
             parameters = _Numbers(*(getattr(channel, name) for name in _NUMERIC))

@@ -1,7 +1,8 @@
 """Channel models: is the message of slot k lost?
 
 One module a model. Each is a scalar function of its parameters, of the slot's uniform random numbers and, where the
-channel has a memory, of its state before the slot; the function also gives the state after it. `MODELS` names them all.
+channel has a memory, of its state before the slot; the function also gives the state after it. `MODELS` names them all,
+but for `trace`, whose verdicts were measured and stand in a file.
 """
 
 from __future__ import annotations

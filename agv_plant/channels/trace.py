@@ -1,0 +1,81 @@
+"""A channel that was measured: the verdicts of a CSV file, slot by slot."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+
+from agv_ros.errors import UserError
+
+ENDS = ("repeat", "hold", "stop")
+"""What follows the last verdict: the first one again, deliveries for ever, or an error."""
+
+_WORDS = {
+    "lost": {"0": False, "1": True},
+    "verdict": {"delivered": False, "lost": True},
+}
+"""The columns that can hold verdicts, each with its words; True where lost."""
+
+
+class TraceError(UserError):
+    """A trace that cannot be used; the text names file, line and reason."""
+
+
+def trace(k: int, verdicts: Sequence[bool], end: str) -> bool:
+    """Verdict `k` of those measured, which are one at least; `end` is one of ENDS.
+
+    Loss rate and outages are the trace's own. Raises TraceError for a slot behind the end of a trace that may not be
+    outrun.
+    """
+    if k < len(verdicts):
+        return verdicts[k]
+    if end == "stop":
+        raise TraceError(
+            f"the trace ends after {len(verdicts)} slots, and slot {k} is asked for: make the run shorter, or set "
+            "trace_end to repeat or hold"
+        )
+    return end == "repeat" and verdicts[k % len(verdicts)]
+
+
+def parse_trace(lines: Iterable[str], name: str) -> tuple[bool, ...]:
+    """Verdicts from the lines of a CSV file called `name` in messages, True where lost.
+
+    The first line names the columns: `lost` (0 or 1) or `verdict` (delivered or lost), and, if the file says so
+    itself, `k`, which must count 0, 1, 2 and so on. Further columns are passed over. Raises TraceError naming the line.
+    """
+    reader = csv.reader(lines)
+    try:
+        header = [cell.strip() for cell in next(reader, [])]
+        named = [column for column in _WORDS if column in header]
+        if len(named) != 1:
+            raise TraceError(f"{name}:1: one column must be called lost or verdict, found {','.join(header)!r}")
+        verdicts: list[bool] = []
+        for row in reader:
+            if row:
+                cells = dict(zip(header, map(str.strip, row), strict=False))
+                verdicts.append(_verdict(cells, named[0], len(verdicts), f"{name}:{reader.line_num}"))
+    except csv.Error as error:
+        raise TraceError(f"{name}:{reader.line_num}: {error}") from None
+    if not verdicts:
+        raise TraceError(f"{name}: no rows below the header")
+    return tuple(verdicts)
+
+
+def _verdict(cells: dict[str, str], column: str, k: int, where: str) -> bool:
+    if cells.get("k", str(k)) != str(k):
+        raise TraceError(f"{where}: k must count 0, 1, 2 ..., expected {k}, found {cells['k']!r}")
+    words, found = _WORDS[column], cells.get(column, "")
+    if found not in words:
+        raise TraceError(f"{where}: {column} must be {' or '.join(words)}, found {found!r}")
+    return words[found]
+
+
+def load_trace(path: str) -> tuple[bool, ...]:
+    """Verdicts from a CSV file, as `parse_trace`. Raises TraceError."""
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            return parse_trace(file, path)
+    except OSError as error:
+        raise TraceError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise TraceError(f"{path}: is not UTF-8 text: {error.reason} at byte {error.start}") from None

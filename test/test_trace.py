@@ -1,0 +1,140 @@
+"""The measured channel: verdicts of a file, the same in the nodes and in the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation.single import simulate
+from agv_analysis.simulation.verdicts import Air
+from agv_plant.channels.trace import TraceError, parse_trace, trace
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio import Channel, losses
+from agv_ros.parameters import ParameterError
+
+if TYPE_CHECKING:
+    from conftest import Drive
+
+REPOSITORY = Path(__file__).parents[1]
+MEASURED = [False, True, True, False, True, False, False]
+
+
+@pytest.fixture
+def measured(tmp_path: Path) -> Path:
+    path = tmp_path / "measured.csv"
+    path.write_text("lost\n" + "".join(f"{int(lost)}\n" for lost in MEASURED))
+    return path
+
+
+def uplink(file: Path, end: str = "repeat", steps: int = 100) -> tuple[str, ...]:
+    return (
+        "relay.uplink.model=trace",
+        f"relay.uplink.trace_file={file}",
+        f"relay.uplink.trace_end={end}",
+        f"plant.duration={steps * 0.005}",
+    )
+
+
+# -- the file ----------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.lists(st.booleans(), min_size=1), st.booleans(), st.booleans())
+def test_what_was_written_is_read(lost: list[bool], words: bool, numbered: bool) -> None:
+    column, text = ("verdict", ("delivered", "lost")) if words else ("lost", ("0", "1"))
+    rows = [f"{k}, {text[value]},x" if numbered else text[value] for k, value in enumerate(lost)]
+    header = f"k,{column},note" if numbered else column
+    assert parse_trace([header, *rows], "file.csv") == tuple(lost)
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        ([], "file.csv:1: one column must be called lost or verdict, found ''"),
+        (["k,loss", "0,1"], "file.csv:1: one column must be called lost or verdict, found 'k,loss'"),
+        (["lost,verdict", "0,lost"], "file.csv:1: one column must be called lost or verdict"),
+        (["lost"], "file.csv: no rows below the header"),
+        (["lost", "0", "2"], "file.csv:3: lost must be 0 or 1, found '2'"),
+        (["verdict", "lost", "", "Lost"], "file.csv:4: verdict must be delivered or lost, found 'Lost'"),
+        (["k,lost", "0,1", "1"], "file.csv:3: lost must be 0 or 1, found ''"),
+        (["k,lost", "0,1", "2,1"], "file.csv:3: k must count 0, 1, 2 ..., expected 1, found '2'"),
+    ],
+)
+def test_a_bad_line_is_named(lines: list[str], complaint: str) -> None:
+    with pytest.raises(TraceError, match="^" + complaint.replace(".", r"\.")):
+        parse_trace(lines, "file.csv")
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.csv", tmp_path):
+        with pytest.raises(TraceError, match=f"{path}: cannot be read"):
+            Channel(ChannelParameters(model="trace", trace_file=str(path)), 1, "uplink")
+    (tmp_path / "binary").write_bytes(b"lost\n\xff\n")
+    with pytest.raises(TraceError, match="not UTF-8"):
+        Channel(ChannelParameters(model="trace", trace_file=str(tmp_path / "binary")), 1, "uplink")
+
+
+def test_a_measured_channel_needs_a_file() -> None:
+    with pytest.raises(ParameterError, match="trace_file is empty"):
+        ChannelParameters(model="trace")
+
+
+# -- the channel -------------------------------------------------------------------------------------------------------
+
+
+def test_ends() -> None:
+    assert [trace(k, MEASURED, "repeat") for k in range(21)] == MEASURED * 3
+    assert [trace(k, MEASURED, "hold") for k in range(21)] == MEASURED + [False] * 14
+    assert [trace(k, MEASURED, "stop") for k in range(7)] == MEASURED
+    with pytest.raises(TraceError, match="ends after 7 slots, and slot 7 is asked for"):
+        trace(7, MEASURED, "stop")
+
+
+@pytest.mark.parametrize("end", ["repeat", "hold"])
+def test_the_simulation_s_verdicts_are_the_relay_s(measured: Path, end: str) -> None:
+    c = ChannelParameters(model="trace", trace_file=str(measured), trace_end=end)
+    expected = MEASURED * 3 if end == "repeat" else MEASURED + [False] * 14
+    assert losses(c, 1, "uplink", 21).tolist() == expected
+    assert Air(1, 21).verdicts(c, "downlink").tolist() == expected
+    channel = Channel(c, 1, "uplink")
+    assert [channel.lost(k) for k in reversed(range(21))] == expected[::-1]
+
+
+def test_slot_0_is_never_lost(tmp_path: Path) -> None:
+    (tmp_path / "all.csv").write_text("lost\n1\n1\n")
+    c = ChannelParameters(model="trace", trace_file=str(tmp_path / "all.csv"))
+    assert losses(c, 1, "uplink", 5).tolist() == [False, True, True, True, True]
+    assert Air(1, 5).verdicts(c, "uplink").tolist() == [False, True, True, True, True]
+
+
+# -- runs --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_trace_that_may_not_be_outrun_ends_the_simulation(measured: Path) -> None:
+    scenario = load_scenario(str(REPOSITORY / "config/paper.yaml"), uplink(measured, "stop"))
+    with pytest.raises(TraceError, match=r"measured\.csv: the trace ends after 7 slots"):
+        simulate(scenario)
+
+
+def test_nodes_lose_what_the_trace_lost(measured: Path, drive: Drive) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    run = drive(*uplink(measured))
+    assert run.lost.tolist() == (MEASURED * 15)[: len(run)]
+    simulated = simulate(run.scenario)
+    assert abs(simulated.error - run.error).max() < 1e-9
+    assert (simulated.n_ul == run.n_ul).all()
+
+
+def test_a_trace_that_may_not_be_outrun_ends_the_nodes(measured: Path, agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    options = [word for setting in uplink(measured, "stop") for word in ("--set", setting)]
+    status, said = agv_ncs("run", "config/paper.yaml", *options, "--bag", measured.parent / "bag")
+    assert status == 1
+    assert "the trace ends after 7 slots" in said
+    assert "Traceback" not in said
