@@ -72,7 +72,7 @@ def stamps_of(messages: NDArray[np.void], header: str = "header") -> Steps:
 
 
 def read_poses(bag: Bag, topic: str, what: str = "pose") -> Track:
-    """The postures of a topic, of a type in POSES, in order. Raises UserError if it has none; `what` it is, for that."""
+    """Postures of a topic of a type in POSES, in order. Raises UserError, which calls them `what`, if it has none."""
     messages = messages_of(bag, topic, tuple(POSES), what)
     path = POSES[bag.topics[topic].type]
     is_odometry = "twist.twist.linear.x" in (messages.dtype.names or ())
