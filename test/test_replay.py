@@ -1,0 +1,178 @@
+"""Recordings played again: what the edge would answer, and outages for other runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from agv_analysis.recording import read_run
+from agv_analysis.replay import compare, with_settings, write_outages
+from agv_analysis.run import Run
+from agv_analysis.scenario import SCHEMAS
+from agv_analysis.simulation.single import simulate
+from agv_plant.channels.trace import load_trace
+from agv_ros.errors import UserError
+
+if TYPE_CHECKING:
+    from conftest import Drive
+
+SAMPLE = Path(__file__).parents[1] / "bags/sample"
+AgvNcs = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture(scope="module")
+def sample() -> Run:
+    return read_run(SAMPLE)
+
+
+def without(run: Run, *rows: int) -> Run:
+    """The run with some of its steps missing."""
+    names = ("k", "pose", "reference", "error", "command", "n_ul", "lost", "downlink_lost")
+    return dataclasses.replace(run, **{name: np.delete(getattr(run, name), rows, axis=0) for name in names})
+
+
+# -- compare -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_unchanged_edge_answers_as_it_did(sample: Run) -> None:
+    comparison = compare(sample, sample.scenario)
+    assert not comparison.differs
+    assert comparison.error.compared == comparison.command.compared == comparison.steps == len(sample)
+    assert max(comparison.error.largest, comparison.command.largest) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("controller.kx=250.0", "controller.v_max=6.0", "relay.uplink.model=burst", "relay.uplink.n=14"),
+        ("relay.uplink.model=gilbert_elliott", "relay.uplink.p=0.1", "relay.uplink.r=0.2",
+         "relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "error_detector.track=eight"),
+        ("plant.integration=arc", "plant.initial_pose=[0.0, 0.0, 20.0]"),
+    ],
+)  # fmt: skip
+def test_the_nodes_answers_follow_from_poses_and_slots(settings: tuple[str, ...], drive: Drive) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    run = drive("plant.duration=2.0", *settings)
+    comparison = compare(run, run.scenario)
+    assert not comparison.differs, comparison
+    assert comparison.command.compared == len(run) == 400
+
+
+def test_another_gain_differs_by_its_share_of_the_command(sample: Run) -> None:
+    """v = v_r cos(theta_e) + K_x x_e is linear in K_x."""
+    assert sample.scenario.controller.v_max == math.inf
+    gain = sample.scenario.controller.kx
+    comparison = compare(sample, with_settings(sample.scenario, [f"controller.kx={gain + 2.0}"]))
+    expected = np.abs(2.0 * sample.error[:, 0])
+    assert comparison.error.first is None
+    assert comparison.command.first == 0
+    assert comparison.command.first_size == pytest.approx(expected[0], abs=1e-12)
+    assert comparison.command.largest == pytest.approx(expected.max(), abs=1e-12)
+    assert comparison.command.largest_at == np.argmax(expected)
+
+
+def test_another_reference_differs_in_the_error(sample: Run) -> None:
+    """A reference that begins 0.25 m further on along the heading of the AGV."""
+    start = sample.scenario.error_detector.track_start
+    moved = [start[0], start[1] + 0.25, start[2]]
+    comparison = compare(sample, with_settings(sample.scenario, [f"error_detector.track_start={moved}"]))
+    assert comparison.error.first == 0
+    assert comparison.error.first_size == pytest.approx(0.25, abs=1e-9)
+
+
+def test_the_first_difference_is_found(sample: Run) -> None:
+    command = sample.command.copy()
+    command[700:, 1] += 2e-9 * np.maximum(1.0, np.abs(command[700:]).max(axis=1))
+    command[300, 0] += 1e-10
+    comparison = compare(dataclasses.replace(sample, command=command), sample.scenario)
+    assert (comparison.error.first, comparison.command.first) == (None, 700)
+
+
+def test_an_answer_that_is_no_number_differs(sample: Run) -> None:
+    pose = sample.pose.copy()
+    pose[~sample.lost & (sample.k == 100)] = np.nan
+    comparison = compare(dataclasses.replace(sample, pose=pose), sample.scenario)
+    assert comparison.differs
+    assert comparison.command.first_size == math.inf
+    assert json.loads(json.dumps(comparison.to_json(), allow_nan=False))["command"]["first_size"] is None
+
+
+def test_steps_without_the_held_pose_are_left_out(sample: Run) -> None:
+    row = int(np.flatnonzero(sample.lost)[0]) - 1  # the pose that is held during the first outage
+    outage = int(np.flatnonzero(~sample.lost[row + 1 :])[0])
+    comparison = compare(without(sample, row), sample.scenario)
+    assert not comparison.differs
+    assert (comparison.steps, comparison.error.compared) == (len(sample) - 1, len(sample) - 1 - outage)
+
+
+def test_nothing_to_compare_is_said(sample: Run) -> None:
+    silent = dataclasses.replace(sample, command=np.full_like(sample.command, np.nan))
+    with pytest.raises(UserError, match="nothing to compare, no step has both edge/cmd_vel"):
+        compare(silent, sample.scenario)
+
+
+def test_the_grid_is_the_recording_s(sample: Run) -> None:
+    with pytest.raises(UserError, match="ts and start_time are those of the recording"):
+        with_settings(sample.scenario, [f"{node}.ts=0.01" for node in SCHEMAS])
+
+
+# -- outages -----------------------------------------------------------------------------------------------------------
+
+
+def test_outages_of_a_recording_are_read_back(sample: Run, tmp_path: Path) -> None:
+    assert write_outages(tmp_path / "lost.csv", sample) == sample.lost.sum() > 0
+    assert load_trace(str(tmp_path / "lost.csv")) == tuple(sample.lost.tolist())
+
+
+def test_recorded_outages_drive_a_run_with_other_gains(sample: Run, tmp_path: Path, drive: Drive) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    write_outages(tmp_path / "lost.csv", sample)
+    trace = ("relay.uplink.model=trace", f"relay.uplink.trace_file={tmp_path / 'lost.csv'}")
+    run = drive("plant.duration=5.0", "controller.kx=5.0", *trace)
+    assert (run.lost == sample.lost[: len(run)]).all()
+    assert np.abs(simulate(run.scenario).pose - run.pose).max() < 1e-9
+
+
+def test_the_downlink_s_outages(tmp_path: Path, drive: Drive) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    run = drive("plant.duration=0.5", "relay.downlink.model=burst", "relay.downlink.n=3")
+    write_outages(tmp_path / "lost.csv", run, downlink=True)
+    assert load_trace(str(tmp_path / "lost.csv")) == (False, True, True, True) * 25
+
+
+def test_missing_slots_are_refused(sample: Run, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="2 slots of edge/slot are missing"):
+        write_outages(tmp_path / "lost.csv", without(sample, 5, 9))
+    assert not (tmp_path / "lost.csv").exists()
+
+
+def test_a_path_that_cannot_be_written(sample: Run, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="cannot be written"):
+        write_outages(tmp_path, sample)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_says_whether_the_edge_changed(agv_ncs: AgvNcs, tmp_path: Path) -> None:
+    status, said = agv_ncs("replay", SAMPLE, "--compare")
+    assert (status, said.count("2000 steps compared, equal")) == (0, 2)
+    status, said = agv_ncs("replay", SAMPLE, "--compare", "--set", "controller.kx=5.0", "--json", tmp_path / "c.json")
+    assert status == 1
+    assert "commands: 2000 steps compared, step 0 is the first to differ" in said
+    assert json.loads((tmp_path / "c.json").read_text())["differs"] is True
+
+
+def test_the_command_s_errors_are_one_line(agv_ncs: AgvNcs, tmp_path: Path) -> None:
+    for arguments in ((SAMPLE,), (SAMPLE, "--outages", tmp_path / "o.csv", "--set", "controller.kx=5.0")):
+        assert agv_ncs("replay", *arguments)[0] == 2
+    status, said = agv_ncs("replay", tmp_path / "none", "--compare")
+    assert status == 1
+    assert "Traceback" not in said
