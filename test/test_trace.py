@@ -19,7 +19,7 @@ from agv_plant.radio import Channel, losses
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:
-    from conftest import Drive
+    from test.conftest import Drive
 
 REPOSITORY = Path(__file__).parents[1]
 MEASURED = [False, True, True, False, True, False, False]
