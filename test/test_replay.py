@@ -21,7 +21,7 @@ from agv_plant.channels.trace import load_trace
 from agv_ros.errors import UserError
 
 if TYPE_CHECKING:
-    from conftest import Drive
+    from test.conftest import Drive
 
 SAMPLE = Path(__file__).parents[1] / "bags/sample"
 AgvNcs = Callable[..., tuple[int, str]]
