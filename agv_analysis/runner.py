@@ -28,6 +28,7 @@ from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode, progress_of
+from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
 from agv_ros.executor import EXECUTORS, FLUSH_TIMEOUT, SETTLE_TIMEOUT, Stop, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
@@ -140,7 +141,10 @@ def _run_nodes(
 
 
 def _connected(scenario: Scenario, recorded: bool) -> Scenario:
-    """The scenario with nodes that wait for each other, and for the recorder."""
+    """The scenario with nodes that wait for each other, and for the recorder. Raises TraceError as the nodes would."""
+    steps = scenario.plant.duration / scenario.plant.ts
+    for channel in (scenario.relay.uplink, scenario.relay.downlink):
+        check_length(channel, steps)
     wait = 1 + recorded
     return Scenario(**{
         name: dataclasses.replace(getattr(scenario, name), wait_for_subscribers=wait) for name in SCHEMAS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -61,6 +62,12 @@ class Channel:
             self._block = uniforms(self._seed, self._stream, first, _BLOCK).tolist()
             self._first_of_block = first
         return self._block[k - first]
+
+
+def check_length(parameters: ChannelParameters, steps: float) -> None:
+    """Is a trace that may not be outrun long enough for a run of `steps`? Raises TraceError before the run if not."""
+    if parameters.model == "trace" and math.isfinite(steps):
+        Channel(parameters, 0, "").lost(max(0, round(steps) - 1))
 
 
 def losses(parameters: ChannelParameters, seed: int, stream: str, steps: int) -> NDArray[np.bool_]:

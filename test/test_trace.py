@@ -19,7 +19,7 @@ from agv_plant.radio import Channel, losses
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:
-    from test.conftest import Drive
+    from test.conftest import Drive, Start
 
 REPOSITORY = Path(__file__).parents[1]
 MEASURED = [False, True, True, False, True, False, False]
@@ -131,10 +131,33 @@ def test_nodes_lose_what_the_trace_lost(measured: Path, drive: Drive) -> None:
     assert (simulated.n_ul == run.n_ul).all()
 
 
-def test_a_trace_that_may_not_be_outrun_ends_the_nodes(measured: Path, agv_ncs: Callable[..., tuple[int, str]]) -> None:
+def test_a_trace_that_may_not_be_outrun_is_refused_before_the_nodes_run(
+    measured: Path, agv_ncs: Callable[..., tuple[int, str]]
+) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     options = [word for setting in uplink(measured, "stop") for word in ("--set", setting)]
-    status, said = agv_ncs("run", "config/paper.yaml", *options, "--bag", measured.parent / "bag")
+    for how in ((), ("--processes",)):
+        status, said = agv_ncs("run", "config/paper.yaml", *options, *how, "--bag", measured.parent / "bag")
+        assert status == 1
+        assert "the trace ends after 7 slots, and slot 99 is asked for" in said
+        assert "Error occurred" not in said
+        assert not (measured.parent / "bag").exists()
+
+
+def test_a_trace_as_long_as_the_run_is_long_enough(measured: Path, drive: Drive) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    assert drive(*uplink(measured, "stop", steps=7)).lost.tolist() == MEASURED
+
+
+def test_a_relay_at_the_end_of_its_trace_ends(measured: Path, start: Start) -> None:
+    """It cannot know how long the run will be, so it says so when it comes to it, and exits."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    trace = {"uplink.model": "trace", "uplink.trace_file": measured, "uplink.trace_end": "stop"}
+    options = [word for name, value in trace.items() for word in ("-p", f"relay:{name}:={value}")]
+    modules = ("agv_plant.plant_node", "agv_cloud.error_detector_node", "agv_cloud.controller_node")
+    connected = ("--ros-args", "-p", "wait_for_subscribers:=1")
+    for module in modules:
+        start(module, *connected)
+    status, said = start("agv_plant.relay_node", *connected, *options).end()
     assert status == 1
-    assert "the trace ends after 7 slots" in said
-    assert "Traceback" not in said
+    assert "the trace ends after 7 slots, and slot 7 is asked for" in said
