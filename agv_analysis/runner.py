@@ -124,16 +124,18 @@ def _run_nodes(
             progress(plant.k)
         return plant.finished or stop.requested
 
-    spin(executor, is_done)
-    pace.see(plant.k)
-    progress(plant.k)
-    for node in loop:
-        node.close()
-        node.flush(FLUSH_TIMEOUT)
-    if recorder is not None:
-        spin_for(executor, recorder.is_settled, SETTLE_TIMEOUT)
-        recorder.close()
-    executor.shutdown()
+    try:
+        spin(executor, is_done)
+        pace.see(plant.k)
+        progress(plant.k)
+    finally:  # whatever ended the loop, what was recorded is kept
+        for node in loop:
+            node.close()
+            node.flush(FLUSH_TIMEOUT)
+        if recorder is not None:
+            spin_for(executor, recorder.is_settled, SETTLE_TIMEOUT)
+            recorder.close()
+        executor.shutdown()
     failure = plant.failure or (f"interrupted at step {plant.k}" if stop.requested else "")
     return Outcome(
         plant.k, pace.rate, failure, recorder.summary if recorder else "", recorder.failure if recorder else ""

@@ -29,8 +29,11 @@ SPIN_TIMEOUT = 0.05
 SETTLE_TIMEOUT = 1.0
 """How long [s] a node that is told to stop waits for messages that are on their way to it."""
 
-FLUSH_TIMEOUT = 0.5
-"""How long [s] a node that ends waits for a subscriber that still has not got everything."""
+FLUSH_TIMEOUT = 1.2
+"""How long [s] a node that is told to end waits for subscribers that still have not got everything."""
+
+LAST_FLUSH_TIMEOUT = 10.0
+"""The same for a node that ends of itself, with nobody waiting for it: on a busy machine a recorder may lag."""
 
 
 class Stop:
@@ -98,7 +101,7 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     spin(executor, lambda: node.finished or stop.requested)
     spin_for(executor, node.is_settled, SETTLE_TIMEOUT)
     node.close()
-    node.flush(FLUSH_TIMEOUT)
+    node.flush(FLUSH_TIMEOUT if stop.requested else LAST_FLUSH_TIMEOUT)
     executor.shutdown()
     node.destroy_node()
     return node.failure

@@ -121,6 +121,9 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         known = parameters_of(schema)
         chosen = draw(st.sets(st.sampled_from(sorted(set(known) - {"ts", "start_time", "lap_time"})), max_size=4))
         lines[node] = {name: draw(values_of(known[name])) for name in chosen - {"track", "wait_for_subscribers"}}
+    for link in ("uplink", "downlink"):
+        if lines["relay"].get(f"{link}.model") == "trace":
+            lines["relay"][f"{link}.trace_file"] = "outages.csv"  # a trace needs one
     nodes = {node: _build(schema, lines[node]) for node, schema in SCHEMAS.items()}
     return Scenario(**nodes)
 
