@@ -74,13 +74,14 @@ class RecorderNode(LoopNode[RecorderParameters]):
     def _describer(self, topic: str, kind: type) -> Callable[[], TopicInfo]:
         module = kind.__module__.split(".")
         type_name = f"{module[0]}/{module[1]}/{kind.__name__}"
+        schema = schema_of(type_name)  # now, not in the middle of a run in real time
 
         def describe() -> TopicInfo:
             publishers = self.get_publishers_info_by_topic(topic)
             offered = [_qos(info.qos_profile) for info in publishers]
             distinct = [qos for i, qos in enumerate(offered) if qos not in offered[:i]]
             type_hash = str(publishers[0].topic_type_hash) if publishers else ""
-            return TopicInfo(topic, type_name, schema_of(type_name), type_hash, distinct)
+            return TopicInfo(topic, type_name, schema, type_hash, distinct)
 
         return describe
 
