@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable
 
 from agv_cloud.tracks import Speeds
-from agv_ros.errors import UserError
+from agv_ros.errors import UserError, open_text
 
 
 class TrackFileError(UserError):
@@ -80,10 +80,5 @@ def _row(
 
 def load_track(path: str) -> SpeedProfile:
     """Speed profile from a CSV file. Raises TrackFileError."""
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            return parse_track(file, path)
-    except OSError as error:
-        raise TrackFileError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise TrackFileError(f"{path}: is not UTF-8 text: {error.reason} at byte {error.start}") from None
+    with open_text(path, TrackFileError, encoding="utf-8-sig", newline="") as file:
+        return parse_track(file, path)

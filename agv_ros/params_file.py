@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+from agv_ros.errors import open_text
 from agv_ros.parameters import SHARED, Parameter, ParameterError, build, check_values, parameters_of
 from agv_ros.ros_yaml import RosYamlError, load
 
@@ -17,13 +18,8 @@ def read_sections(path: str) -> dict[str, dict[str, Any]]:
 
     Raises ParameterError if the file cannot be read or is no parameter file.
     """
-    try:
-        with open(path, encoding="utf-8") as file:
-            return parse_sections(file.read(), path)
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise ParameterError(f"{path}: is not UTF-8 text: {error.reason} at byte {error.start}") from None
+    with open_text(path, ParameterError) as file:
+        return parse_sections(file.read(), path)
 
 
 def parse_sections(text: str, name: str) -> dict[str, dict[str, Any]]:

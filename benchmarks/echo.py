@@ -28,7 +28,6 @@ from sensor_msgs.msg import TimeReference
 from agv_ros.node import LOOP_QOS
 
 ROLES = ("plant", "relay", "error_detector", "controller")
-SHAPES = ("loop", "raw", "four_hop")
 
 
 def _message(kind: type) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Sequence
 
-from agv_ros.errors import UserError
+from agv_ros.errors import UserError, open_text
 
 ENDS = ("repeat", "hold", "stop")
 """What follows the last verdict: the first one again, deliveries for ever, or an error."""
@@ -72,10 +72,5 @@ def _verdict(cells: dict[str, str], column: str, k: int, where: str) -> bool:
 
 def load_trace(path: str) -> tuple[bool, ...]:
     """Verdicts from a CSV file, as `parse_trace`. Raises TraceError."""
-    try:
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            return parse_trace(file, path)
-    except OSError as error:
-        raise TraceError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise TraceError(f"{path}: is not UTF-8 text: {error.reason} at byte {error.start}") from None
+    with open_text(path, TraceError, encoding="utf-8-sig", newline="") as file:
+        return parse_trace(file, path)
