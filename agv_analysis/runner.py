@@ -30,7 +30,7 @@ from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode, progress_of
 from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
-from agv_ros.executor import EXECUTORS, FLUSH_TIMEOUT, SETTLE_TIMEOUT, Stop, spin, spin_for, stop_on_signals
+from agv_ros.executor import EXECUTORS, Stop, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
 from agv_ros.parameters import as_dict
 
@@ -51,8 +51,14 @@ _MODULES = {
     "recorder": "agv_analysis.recorder_node",
 }
 
-_STOP_TIMEOUT = 10.0
-"""How long [s] a process that was asked to stop may take; a node needs less than 2 s, a recorder writes its bag."""
+_PATIENCE = 15.0
+"""How long [s] a run that is interrupted waits for its recorder, if there is one that lags: nothing shall be lost.
+
+DDS says only every 3 s that a message is there which a busy reader has missed.
+"""
+
+_STOP_TIMEOUT = 20.0
+"""How long [s] a process that was asked to stop may take; more than `_PATIENCE`."""
 
 _LOOK_PERIOD = 0.1
 """How often [s] the processes are looked at while they run."""
@@ -131,9 +137,9 @@ def _run_nodes(
     finally:  # whatever ended the loop, what was recorded is kept
         for node in loop:
             node.close()
-            node.flush(FLUSH_TIMEOUT)
+            node.flush(_PATIENCE)
         if recorder is not None:
-            spin_for(executor, recorder.is_settled, SETTLE_TIMEOUT)
+            spin_for(executor, recorder.is_settled, _PATIENCE)
             recorder.close()
         executor.shutdown()
     failure = plant.failure or (f"interrupted at step {plant.k}" if stop.requested else "")
@@ -147,15 +153,13 @@ def _connected(scenario: Scenario, recorded: bool) -> Scenario:
     steps = scenario.plant.duration / scenario.plant.ts
     for channel in (scenario.relay.uplink, scenario.relay.downlink):
         check_length(channel, steps)
-    wait = 1 + recorded
-    return Scenario(**{
-        name: dataclasses.replace(getattr(scenario, name), wait_for_subscribers=wait) for name in SCHEMAS
-    })  # fmt: skip
+    met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": _PATIENCE if recorded else scenario.plant.stop_timeout}
+    return Scenario(**{name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS})
 
 
 def _recording(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
     log_time = "stamp" if scenario.plant.clock == "lockstep" else "receive"
-    return RecorderParameters(bag=str(bag), params_file=str(params), log_time=log_time)
+    return RecorderParameters(bag=str(bag), params_file=str(params), log_time=log_time, stop_timeout=_PATIENCE)
 
 
 @contextmanager
@@ -214,6 +218,8 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
         progress(plant.steps)
     ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
     recorder = nodes.pop("recorder", None)
+    for node in nodes.values():
+        node.tell(signal.SIGINT)
     for node in nodes.values():
         node.stop(signal.SIGINT)
     if recorder is not None:
@@ -278,11 +284,15 @@ class _Process:
         """The last line that it printed."""
         return self._lines[-1] if self._lines else f"exit status {self.status}, without a word"
 
-    def stop(self, number: signal.Signals) -> None:
-        """End it, if need be by force, and collect the rest of what it said."""
+    def tell(self, number: signal.Signals) -> None:
+        """Send it a signal, unless it has ended."""
         if self.is_running():
             self._process.send_signal(number)
-            if self.is_running(_STOP_TIMEOUT):
-                self._process.kill()
+
+    def stop(self, number: signal.Signals) -> None:
+        """End it, if need be by force, and collect the rest of what it said."""
+        self.tell(number)
+        if self.is_running(_STOP_TIMEOUT):
+            self._process.kill()
         self._process.wait()
         self._reader.join()

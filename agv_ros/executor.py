@@ -26,14 +26,8 @@ EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "sing
 SPIN_TIMEOUT = 0.05
 """Longest wait [s] for the next event. Unbounded, the events executor neither runs timers nor sees signals."""
 
-SETTLE_TIMEOUT = 1.0
-"""How long [s] a node that is told to stop waits for messages that are on their way to it."""
-
-FLUSH_TIMEOUT = 1.2
-"""How long [s] a node that is told to end waits for subscribers that still have not got everything."""
-
 LAST_FLUSH_TIMEOUT = 10.0
-"""The same for a node that ends of itself, with nobody waiting for it: on a busy machine a recorder may lag."""
+"""How long [s] a node that ends of itself, with nobody waiting for it, waits for subscribers that lag."""
 
 
 class Stop:
@@ -99,9 +93,10 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     executor = EventsExecutor()
     executor.add_node(node)
     spin(executor, lambda: node.finished or stop.requested)
-    spin_for(executor, node.is_settled, SETTLE_TIMEOUT)
+    deadline = time.monotonic() + (node.settings.stop_timeout if stop.requested else LAST_FLUSH_TIMEOUT)
+    spin_for(executor, node.is_settled, deadline - time.monotonic())
     node.close()
-    node.flush(FLUSH_TIMEOUT if stop.requested else LAST_FLUSH_TIMEOUT)
+    node.flush(max(0.0, deadline - time.monotonic()))
     executor.shutdown()
     node.destroy_node()
     return node.failure

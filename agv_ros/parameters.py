@@ -209,6 +209,14 @@ class LoopParameters:
         low=0,
         high=100,
     )
+    stop_timeout: float = parameter(
+        1.2,
+        "a node that is told to stop waits this long, at most, for messages that are on their way to it or to its "
+        "subscribers; a recorder on a busy machine may lag by seconds",
+        unit="s",
+        low=0.0,
+        high=60.0,
+    )
 
 
-SHARED = ("ts", "start_time", "wait_for_subscribers")
+SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 
 from agv_analysis.message_schema import schema_of
 from agv_analysis.recorder_node import RecorderNode
@@ -127,6 +129,38 @@ def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, tmp_path: Pa
     assert status == 1
     assert "interrupted after step" in said
     assert not read_run(where).unexplained
+
+
+def test_an_interrupted_run_waits_for_a_recorder_that_lags(start: Start, tmp_path: Path) -> None:
+    """The recorder's process sleeps for some hundred steps, as on a busy machine: all of them are in the bag."""
+    where = tmp_path / "bag"
+    run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = EXECUTORS["single"](context=context)
+    listener = rclpy.create_node("listener", context=context, use_global_arguments=False)
+    seen: list[Clock] = []
+    listener.create_subscription(Clock, "/clock", seen.append, LOOP_QOS)
+    executor.add_node(listener)
+    assert spin_for(executor, lambda: len(seen) > 20, 60.0)
+    recorder = next(child for child in children(run.process.pid) if "recorder_node" in child.read_text())
+    os.kill(int(recorder.parent.name), signal.SIGSTOP)
+    begun = len(seen)
+    assert spin_for(executor, lambda: len(seen) > begun + 300, 60.0)
+    run.process.send_signal(signal.SIGTERM)
+    os.kill(int(recorder.parent.name), signal.SIGCONT)
+    listener.destroy_node()
+    context.try_shutdown()
+    _, said = run.end()
+    assert "everything that was published" in said
+    assert len(read_run(where)) > 300
+    assert not read_run(where).unexplained
+
+
+def children(pid: int) -> list[Path]:
+    """The command lines of a process's children."""
+    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [Path("/proc", child, "cmdline") for child in found]
 
 
 def test_the_recorder_says_what_it_has_missed(tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     for node, schema in SCHEMAS.items():
         known = parameters_of(schema)
         chosen = draw(st.sets(st.sampled_from(sorted(set(known) - {"ts", "start_time", "lap_time"})), max_size=4))
-        lines[node] = {name: draw(values_of(known[name])) for name in chosen - {"track", "wait_for_subscribers"}}
+        lines[node] = {name: draw(values_of(known[name])) for name in chosen - {"track", "wait_for_subscribers", "stop_timeout"}}
     for link in ("uplink", "downlink"):
         if lines["relay"].get(f"{link}.model") == "trace":
             lines["relay"][f"{link}.trace_file"] = "outages.csv"  # a trace needs one
