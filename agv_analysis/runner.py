@@ -154,7 +154,10 @@ def _connected(scenario: Scenario, recorded: bool) -> Scenario:
     for channel in (scenario.relay.uplink, scenario.relay.downlink):
         check_length(channel, steps)
     met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": _PATIENCE if recorded else scenario.plant.stop_timeout}
-    return Scenario(**{name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS})
+    nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
+    if scenario.error_detector.policy == "predict":  # which listens to the controller's commands as well
+        nodes["controller"] = dataclasses.replace(nodes["controller"], wait_for_subscribers=2 + recorded)
+    return Scenario(**nodes)
 
 
 def _recording(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:

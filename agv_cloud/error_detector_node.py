@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import TimeReference
 
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
+from agv_cloud.staleness import Posture, Prediction
 from agv_cloud.tracking_error import tracking_error
+from agv_plant.unicycle import STEPS
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
 from agv_ros.stamps import Steps
-from agv_ros.wire import InvalidMessageError, Pose, TrackingError, decode_pose, decode_slot, encode_error, stamp_of
+from agv_ros.wire import (
+    InvalidMessageError,
+    Pose,
+    TrackingError,
+    decode_command,
+    decode_pose,
+    decode_slot,
+    encode_error,
+    stamp_of,
+)
 
 
 class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
@@ -28,9 +40,18 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._join: SlotJoin[Pose] = SlotJoin(self.grid.start_ns)
         self._steps = Steps(self.grid)
         self._blind = 0
+        self._predicts = self.settings.policy == "predict"
+        self._prediction = self._new_prediction()
+        self._ready: deque[Joined[Pose]] = deque()
+        self._answered = -1
         self._error_out = self.output(Odometry, "edge/error")
         self.input(PoseStamped, "edge/pose", self._on_pose, self._error_out)
         self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
+        if self._predicts:
+            self.input(TwistStamped, "edge/cmd_vel", self._on_command)
+
+    def _new_prediction(self) -> Prediction:
+        return Prediction(STEPS[self.settings.integration], self.settings.ts)
 
     def _on_pose(self, data: bytes) -> None:
         try:
@@ -46,15 +67,38 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self.report_every_second(slot.stamp_ns)
         self._answer(self._join.add_slot(slot))
 
+    def _on_command(self, data: bytes) -> None:
+        command = decode_command(data)
+        self._prediction.add_command(self._steps.of(command.stamp_ns), command.v, command.w)
+        self._answer([])
+
     def _answer(self, ready: list[Joined[Pose]]) -> None:
-        for joined in ready:
-            stamp_ns, pose = joined.slot.stamp_ns, joined.message
-            if pose is None:
-                self._blind += 1
-                continue
-            target = self.reference[self.grid.step(stamp_ns)]
-            eps = tracking_error(target.x, target.y, target.theta, pose.x, pose.y, pose.theta)
-            self._error_out.publish(encode_error(TrackingError(stamp_ns, *eps, target.v, target.w)))
+        self._ready.extend(ready)
+        while self._ready and self._may_answer():
+            self._answer_one(self._ready.popleft())
+
+    def _may_answer(self) -> bool:
+        """A prediction waits for the command that answers the step before, unless the next step comes first."""
+        if not self._predicts or len(self._ready) > 1:
+            return True
+        k = self.grid.step(self._ready[0].slot.stamp_ns)
+        return k - 1 != self._answered or self._prediction.has_command(k - 1)
+
+    def _answer_one(self, joined: Joined[Pose]) -> None:
+        stamp_ns, pose = joined.slot.stamp_ns, joined.message
+        if pose is None:
+            self._blind += 1
+            return
+        k, taken = self.grid.step(stamp_ns), self.grid.step(pose.stamp_ns)
+        now, held = self.reference[k], Posture(pose.x, pose.y, pose.theta)
+        target = self.reference[taken] if self.settings.policy == "align" else now
+        if self._predicts:
+            if k == 0:
+                self._prediction = self._new_prediction()  # a run begins: what was sent in one before it is past
+            held = self._prediction.at(k, taken, held)
+        eps = tracking_error(target.x, target.y, target.theta, *held)
+        self._answered = k
+        self._error_out.publish(encode_error(TrackingError(stamp_ns, *eps, now.v, now.w)))
 
     def facts(self) -> dict[str, str]:
         """Slots that were not answered, by reason."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from agv_cloud.staleness import POLICIES
 from agv_cloud.tracks import TRACKS
+from agv_plant.unicycle import STEPS
 from agv_ros.parameters import LoopParameters, ParameterError, parameter
-
-POLICIES = ("hold",)
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,15 @@ class ErrorDetectorParameters(LoopParameters):
     speed: float = parameter(
         1.0, "speed of the tracks line, circle, eight and warehouse", unit="m/s", above=0.0, high=100.0
     )
-    policy: str = parameter("hold", "what the edge does with an outdated pose", choices=POLICIES)
+    policy: str = parameter(
+        "hold",
+        "what an outdated pose is compared with; hold: the reference of now, align: that of its instant, predict: it "
+        "is moved on by the plant's model under the commands sent since, and compared with the reference of now",
+        choices=POLICIES,
+    )
+    integration: str = parameter(
+        "euler", "predict: how the plant's model integrates one period, as plant.integration", choices=tuple(STEPS)
+    )
 
     def __post_init__(self) -> None:
         """Check what no single bound can say."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from agv_plant.channels import MODELS
 from agv_plant.channels.trace import ENDS
+from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.unicycle import STEPS
 from agv_ros.parameters import LoopParameters, ParameterError, group, parameter
 
@@ -33,6 +34,21 @@ class PlantParameters(LoopParameters):
     )
     cmd_vel_timeout: float = parameter(
         0.5, "realtime: the AGV stops when its newest command is older than this", unit="s", above=0.0, high=3600.0
+    )
+    downlink_policy: str = parameter(
+        "hold",
+        "what the AGV does in a step whose command did not arrive; hold: it obeys the newest one, zero: it stands "
+        "still, ramp: it slows down to a stand within ramp_time",
+        choices=DOWNLINK_POLICIES,
+    )
+    ramp_time: float = parameter(0.2, "ramp: time from the newest command to a stand", unit="s", above=0.0, high=3600.0)
+    speed_scale: float = parameter(
+        1.0, "true speed over commanded speed: a worn or badly measured wheel", above=0.0, high=10.0
+    )
+    w_max: float = parameter(math.inf, "limit on |w|, .inf: none", unit="rad/s", above=0.0, high=math.inf)
+    a_max: float = parameter(math.inf, "limit on |dv/dt|, .inf: none", unit="m/s^2", above=0.0, high=math.inf)
+    lag: float = parameter(
+        0.0, "time constant with which the drive follows a command; 0: at once", unit="s", low=0.0, high=60.0
     )
 
 

@@ -17,6 +17,8 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
+from agv_plant.actuator import driven_speeds
+from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.held_command import HeldCommand
 from agv_plant.parameters import PlantParameters
 from agv_plant.punctuality import Punctuality
@@ -65,6 +67,8 @@ class PlantNode(LoopNode[PlantParameters]):
         self._steps_per_line = max(1, round(self.steps / 20 if math.isfinite(self.steps) else 10.0 / settings.ts))
         self.state = State(*settings.initial_pose)
         self._step = STEPS[settings.integration]
+        self._speeds = (0.0, 0.0)
+        self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
         self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
         self._held = HeldCommand(to_nanoseconds(settings.cmd_vel_timeout))
         self.punctuality = Punctuality(self.grid.ts_ns)
@@ -98,8 +102,14 @@ class PlantNode(LoopNode[PlantParameters]):
         self._pose_out.publish(encode_pose(Pose(stamp_ns, *self.state)))
 
     def _advance(self, command: Command) -> None:
-        """From step k to k + 1 under a command."""
-        state = State(*self._step(*self.state, command.v, command.w, self.settings.ts))
+        """From step k to k + 1 under the newest command."""
+        plant, age = self.settings, (self.grid.stamp(self.k) - command.stamp_ns) // self.grid.ts_ns
+        share = share_of_command(age, self._downlink_policy, plant.ramp_time / plant.ts)
+        self._speeds = driven_speeds(
+            share * command.v, share * command.w, *self._speeds, plant.ts, plant.w_max, plant.a_max, plant.lag
+        )
+        v, w = self._speeds
+        state = State(*self._step(*self.state, plant.speed_scale * v, w, plant.ts))
         if not all(map(math.isfinite, state)):
             self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")
             return

@@ -211,7 +211,7 @@ class LoopParameters:
     )
     stop_timeout: float = parameter(
         1.2,
-        "a node that is told to stop waits this long, at most, for messages that are on their way to it or to its "
+        "a node that is told to stop waits this long, at most, for messages on their way to it or to its "
         "subscribers; a recorder on a busy machine may lag by seconds",
         unit="s",
         low=0.0,

@@ -113,6 +113,10 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
     return st.sampled_from(found.choices) if found.choices else st.text()
 
 
+ALONE = {"track", "wait_for_subscribers", "stop_timeout"}
+"""What a file may not set for one node without setting something else."""
+
+
 @st.composite
 def scenarios(draw: st.DrawFn) -> Scenario:
     """Any scenario that the schemas allow."""
@@ -120,7 +124,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     for node, schema in SCHEMAS.items():
         known = parameters_of(schema)
         chosen = draw(st.sets(st.sampled_from(sorted(set(known) - {"ts", "start_time", "lap_time"})), max_size=4))
-        lines[node] = {name: draw(values_of(known[name])) for name in chosen - {"track", "wait_for_subscribers", "stop_timeout"}}
+        lines[node] = {name: draw(values_of(known[name])) for name in chosen - ALONE}
     for link in ("uplink", "downlink"):
         if lines["relay"].get(f"{link}.model") == "trace":
             lines["relay"][f"{link}.trace_file"] = "outages.csv"  # a trace needs one

@@ -23,6 +23,17 @@ RUNS = {
     "bursts, limited": ("relay.uplink.model=burst", "relay.uplink.n=9", "controller.v_max=6.0"),
     "arc, eight": (*LOSSY, "plant.integration=arc", "error_detector.track=eight", "relay.downlink.model=burst",
                    "relay.downlink.n=2"),
+    "align": (*LOSSY, "error_detector.policy=align"),
+    "predict": (*LOSSY, "error_detector.policy=predict", "plant.speed_scale=1.1", "controller.v_max=6.0"),
+    "predict on the arc, lossy downlink": (
+        *LOSSY, "error_detector.policy=predict", "error_detector.integration=arc", "plant.integration=arc",
+        "relay.downlink.model=bernoulli", "relay.downlink.p=0.2",
+    ),
+    "stops in outages": (*LOSSY, "relay.downlink.model=burst", "relay.downlink.n=4", "plant.downlink_policy=zero"),
+    "slows down in outages": (
+        "relay.downlink.model=burst", "relay.downlink.n=9", "plant.downlink_policy=ramp", "plant.ramp_time=0.03",
+    ),
+    "a heavy AGV": (*LOSSY, "plant.a_max=3.0", "plant.lag=0.02", "plant.w_max=1.5", "error_detector.track=eight"),
 }  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.simulation.compiled import compiled, numbers
-from agv_analysis.simulation.loop import Loop, Rows, Settings, answer, at_rest, goes_on, obey
+from agv_analysis.simulation.loop import Loop, Rows, Settings, answer, at_rest, goes_on, obey, received
 from agv_analysis.simulation.single import settings_of, steps_of
 from agv_cloud.reference import Reference
 
@@ -59,7 +59,8 @@ def drive(reference: Rows, start: Loop, settings: Settings, n: int, rows: NDArra
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
         then = max(0, k - n)
         x, y, theta = rows[then]
-        held = Loop(loop.x, loop.y, loop.theta, x, y, theta, k - then, loop.v, loop.w)
+        x_then, y_then, theta_then, _, _ = reference[then]
+        held = received(loop, x, y, theta, x_then, y_then, theta_then, k - then)
         sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
         loop = obey(held, sent, False, settings)
         if not goes_on(loop, sent):

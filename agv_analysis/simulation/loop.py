@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from agv_analysis.convergence import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
+from agv_plant.actuator import driven_speeds
+from agv_plant.downlink_policy import share_of_command
 from agv_plant.unicycle import arc_step, euler_step
 
 Rows = NDArray[np.float64] | list[list[float]]
@@ -33,6 +36,18 @@ class Settings(NamedTuple):
     ts: float
     arc: bool
     """Does the plant integrate along the arc, or by Euler?"""
+    policy: int
+    """Staleness policy at the edge, one of `staleness.HOLD`, `ALIGN`, `PREDICT`."""
+    model_arc: bool
+    """The same as `arc`, for the edge's model of the plant."""
+    plain: bool
+    """Is the plant the paper's? Then what follows is at its defaults and need not be looked at."""
+    downlink_policy: int
+    ramp_steps: float
+    speed_scale: float
+    w_max: float
+    a_max: float
+    lag: float
 
 
 class Loop(NamedTuple):
@@ -42,14 +57,23 @@ class Loop(NamedTuple):
     y: float
     theta: float
     x_held: float
-    """The freshest pose that the edge holds."""
+    """The freshest pose that the edge holds; under `predict`, moved on to the next slot."""
     y_held: float
     theta_held: float
+    x_then: float
+    """The reference at the instant of that pose."""
+    y_then: float
+    theta_then: float
     n_ul: int
     """Steps since it was taken."""
     v: float
-    """The command that the plant obeys: zero before the first one arrives."""
+    """The newest command that the plant holds: zero before the first one arrives."""
     w: float
+    n_dl: int
+    """Steps since it was sent."""
+    v_driven: float
+    """The speeds that the plant drove at in the period before."""
+    w_driven: float
 
 
 class Answer(NamedTuple):
@@ -73,7 +97,7 @@ class Case(NamedTuple):
 
 def at_rest(x: float, y: float, theta: float) -> Loop:
     """The loop before slot 0 with the AGV at a pose in frame `map` [m, m, rad]."""
-    return Loop(x, y, theta, x, y, theta, 0, 0.0, 0.0)
+    return Loop(x, y, theta, x, y, theta, math.nan, math.nan, math.nan, 0, 0.0, 0.0, 0, 0.0, 0.0)
 
 
 # -- one slot ----------------------------------------------------------------------------------------------------------
@@ -91,15 +115,33 @@ def slot(
     settings: Settings,
 ) -> tuple[Loop, Answer]:
     """From one pose to the next, under the verdicts of both links and with the reference at this step."""
-    x, y, theta, v, w = loop.x, loop.y, loop.theta, loop.v, loop.w
+    x, y, theta = loop.x, loop.y, loop.theta
     if lost:
-        held = Loop(x, y, theta, loop.x_held, loop.y_held, loop.theta_held, loop.n_ul + 1, v, w)
+        held = outdated(loop)
         sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
         return obey(held, sent, downlink_lost, settings), sent
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
-    held = Loop(x, y, theta, x, y, theta, 0, v, w)
+    held = received(loop, x, y, theta, x_r, y_r, theta_r, 0)
     sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
     return obey(held, sent, downlink_lost, settings), sent
+
+
+def outdated(loop: Loop) -> Loop:
+    """The edge holds what it held before, one step older."""
+    return Loop(
+        loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
+        loop.theta_then, loop.n_ul + 1, loop.v, loop.w, loop.n_dl, loop.v_driven, loop.w_driven,
+    )  # fmt: skip
+
+
+def received(
+    loop: Loop, x: float, y: float, theta: float, x_then: float, y_then: float, theta_then: float, n_ul: int
+) -> Loop:
+    """The edge holds a pose that was taken n_ul steps ago, when the reference was at (x_then, y_then, theta_then)."""
+    return Loop(
+        loop.x, loop.y, loop.theta, x, y, theta, x_then, y_then, theta_then, n_ul, loop.v, loop.w, loop.n_dl,
+        loop.v_driven, loop.w_driven,
+    )  # fmt: skip
 
 
 def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings) -> Answer:
@@ -107,6 +149,8 @@ def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: 
 
     An error beyond the range of numbers is refused by the controller, as it comes in from the wire.
     """
+    if settings.policy == ALIGN:
+        x_r, y_r, theta_r = loop.x_then, loop.y_then, loop.theta_then
     x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, loop.x_held, loop.y_held, loop.theta_held)
     if not are_finite(x_e, y_e, theta_e):
         return Answer(x_e, y_e, theta_e, math.nan, math.nan)
@@ -115,18 +159,40 @@ def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: 
 
 
 def obey(loop: Loop, sent: Answer, lost: bool, settings: Settings) -> Loop:
-    """One sampling period of the plant under the freshest command.
+    """One sampling period of the plant under the freshest command, and of the edge's model under the one it sent.
 
     A command beyond the range of numbers is refused by the plant, which goes on with the one before.
     """
-    v, w = sent.v, sent.w
+    v, w, n_dl = sent.v, sent.w, 0
     if lost or not are_finite(v, w, 0.0):
-        v, w = loop.v, loop.w
-    if settings.arc:
-        x, y, theta = arc_step(loop.x, loop.y, loop.theta, v, w, settings.ts)
-    else:
-        x, y, theta = euler_step(loop.x, loop.y, loop.theta, v, w, settings.ts)
-    return Loop(x, y, theta, loop.x_held, loop.y_held, loop.theta_held, loop.n_ul, v, w)
+        v, w, n_dl = loop.v, loop.w, loop.n_dl + 1
+    v_driven, w_driven, speed = v, w, v
+    if not settings.plain:
+        share = share_of_command(n_dl, settings.downlink_policy, settings.ramp_steps)
+        v_driven, w_driven = driven_speeds(
+            share * v, share * w, loop.v_driven, loop.w_driven, settings.ts, settings.w_max, settings.a_max,
+            settings.lag,
+        )  # fmt: skip
+        speed = settings.speed_scale * v_driven
+    x, y, theta = plant_step(settings.arc, loop.x, loop.y, loop.theta, speed, w_driven, settings.ts)
+    x_held, y_held, theta_held = loop.x_held, loop.y_held, loop.theta_held
+    if settings.policy == PREDICT and are_finite(sent.v, sent.w, 0.0):
+        x_held, y_held, theta_held = plant_step(
+            settings.model_arc, x_held, y_held, theta_held, sent.v, sent.w, settings.ts
+        )
+    return Loop(
+        x, y, theta, x_held, y_held, theta_held, loop.x_then, loop.y_then, loop.theta_then, loop.n_ul, v, w, n_dl,
+        v_driven, w_driven,
+    )  # fmt: skip
+
+
+def plant_step(
+    arc: bool, x: float, y: float, theta: float, v: float, w: float, ts: float
+) -> tuple[float, float, float]:
+    """One sampling period by the one or the other integration."""
+    if arc:
+        return arc_step(x, y, theta, v, w, ts)
+    return euler_step(x, y, theta, v, w, ts)
 
 
 def goes_on(loop: Loop, sent: Answer) -> bool:

@@ -11,8 +11,15 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Case, Settings, at_rest, history
 from agv_cloud.reference import Reference
+from agv_cloud.staleness import POLICIES
+from agv_plant.downlink_policy import DOWNLINK_POLICIES
+from agv_plant.parameters import PlantParameters
 from agv_plant.radio import losses
 from agv_ros.errors import UserError
+
+_PAPERS_PLANT = {
+    name: getattr(PlantParameters(), name) for name in ("downlink_policy", "speed_scale", "w_max", "a_max", "lag")
+}
 
 
 def simulate(scenario: Scenario) -> Run:
@@ -56,8 +63,17 @@ def steps_of(scenario: Scenario) -> int:
 
 def settings_of(scenario: Scenario) -> Settings:
     """What a slot of the loop needs to know of a scenario."""
-    gains, plant = scenario.controller, scenario.plant
-    return Settings(gains.kx, gains.ky, gains.ktheta, gains.v_max, plant.ts, plant.integration == "arc")
+    gains, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
+    return Settings(
+        kx=gains.kx, ky=gains.ky, ktheta=gains.ktheta, v_max=gains.v_max, ts=plant.ts,
+        arc=plant.integration == "arc",
+        policy=POLICIES.index(edge.policy),
+        model_arc=edge.integration == "arc",
+        plain=all(getattr(plant, name) == value for name, value in _PAPERS_PLANT.items()),
+        downlink_policy=DOWNLINK_POLICIES.index(plant.downlink_policy),
+        ramp_steps=plant.ramp_time / plant.ts,
+        speed_scale=plant.speed_scale, w_max=plant.w_max, a_max=plant.a_max, lag=plant.lag,
+    )  # fmt: skip
 
 
 def _notes(scenario: Scenario, done: int, steps: int, command: Floats) -> list[str]:
