@@ -18,7 +18,10 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.10",
     packages=find_packages(include=["agv_ros*", "agv_plant*", "agv_cloud*", "agv_analysis*"]),
-    package_data={package: ["py.typed"] for package in ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")},
+    package_data={
+        **{package: ["py.typed"] for package in ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")},
+        "agv_analysis.report": ["*.j2"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -28,11 +31,13 @@ setup(
     install_requires=[
         "setuptools",
         "click>=8.1",
+        "jinja2>=3.0",
         "matplotlib>=3.6",
         "lz4>=4.0",
         "mcap>=1.2",
         "numba>=0.57",
         "numpy>=1.23",
+        "plotly>=6.0",
         "pyyaml>=6.0",
         "rich>=12.0",
         "rosbags>=0.10",
@@ -56,6 +61,7 @@ setup(
             "pytest-xdist>=3.3",
             "ruff>=0.6",
             "scipy>=1.9",
+            "selenium>=4.11",
             "types-PyYAML",
         ],
     },

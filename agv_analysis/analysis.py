@@ -236,12 +236,17 @@ def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:
 
 
 def paper_test(run: Run) -> PaperTest:
-    """The paper's test (eq. 55, 56) with the headings, speeds and outages of a run.
+    """The paper's test (eq. 55, 56) with the headings, speeds and outages of a run."""
+    radii = paper.spectral_radii(*paper_inputs(run), run.scenario.controller, run.ts)
+    worst = int(np.argmax(radii))
+    return PaperTest(float(radii[worst]), int(run.k[worst]))
+
+
+def paper_inputs(run: Run) -> tuple[Floats, Floats, Floats]:
+    """What A(k) of eq. 55 depends on at each step: theta_c(k), theta_c(k-n) [rad], v_r(k-n) [m/s], each of shape (N,).
 
     Where the pose that the edge held is missing from the recording the oldest one before it stands for it.
     """
     held = np.clip(np.searchsorted(run.k, run.k - run.n_ul), 0, len(run) - 1)
     theta = run.pose[:, 2]
-    radii = paper.spectral_radii(theta, theta[held], run.reference[held, 3], run.scenario.controller, run.ts)
-    worst = int(np.argmax(radii))
-    return PaperTest(float(radii[worst]), int(run.k[worst]))
+    return theta, theta[held], run.reference[held, 3]

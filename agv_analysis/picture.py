@@ -43,7 +43,7 @@ def draw(run: Run, path: Path) -> None:
 
 def _track(axes: Axes, run: Run) -> None:
     axes.plot(run.reference[:, 0], run.reference[:, 1], color=REFERENCE, lw=3.0, alpha=0.5, label="reference")
-    x, y = _within(run.pose[:, 0], run.reference[:, 0]), _within(run.pose[:, 1], run.reference[:, 1])
+    x, y = within(run.pose[:, 0], run.reference[:, 0]), within(run.pose[:, 1], run.reference[:, 1])
     axes.plot(x, y, color=DRIVEN, lw=1.0, label="AGV")
     axes.plot(x[run.lost], y[run.lost], ".", color=LOST, ms=2.0, label="pose lost")
     axes.plot(x[0], y[0], "o", color=DRIVEN, ms=5.0)
@@ -52,7 +52,7 @@ def _track(axes: Axes, run: Run) -> None:
     axes.legend(loc="best", fontsize="small")
 
 
-def _within(values: Floats, reference: Floats) -> Floats:
+def within(values: Floats, reference: Floats) -> Floats:
     """Values that lie within some laps of the reference; what is far away would shrink the track to a point."""
     reach = 2.0 * (np.ptp(reference) + 10.0)
     near = np.abs(values - np.mean(reference)) <= reach

@@ -19,7 +19,7 @@ def print_table(analysis: Observations) -> None:
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
-    for name, value in _rows(analysis):
+    for name, value in rows(analysis):
         table.add_row(name, value)
     console.print(table)
     for sentence in analysis.disagreements():
@@ -32,7 +32,8 @@ def print_table(analysis: Observations) -> None:
         console.print(f"[dim]Note: {escape(note)}.[/]")
 
 
-def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
+def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
+    """Name and value of each figure, as text with rich's markup."""
     run, up = analysis.run, analysis.outages.uplink
     ms = 1e3 * run.ts
     seed = f", seed {run.scenario.relay.seed}" if run.gains_known else ""

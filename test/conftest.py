@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
     from agv_analysis.run import Run
 
 REPOSITORY = Path(__file__).parents[1]
@@ -118,3 +121,25 @@ def start() -> Iterator[Start]:
 def agv_ncs(start: Start) -> Callable[..., tuple[int, str]]:
     """Run a command of `agv-ncs` to its end: exit status and output."""
     return lambda *arguments, **options: start("agv_analysis.cli", *map(str, arguments), **options).end(300.0)
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Chrome]:
+    """Headless Chromium, Debian's, one for all tests of a process; its log is emptied before each page."""
+    pytest.importorskip("selenium", reason="needs selenium: pip install '.[test]'")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if browser is None or driver is None:
+        pytest.skip("needs Chromium and its driver: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = browser
+    for argument in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "enable-unsafe-swiftshader"):
+        options.add_argument(f"--{argument}")
+    options.add_argument("--window-size=1100,1400")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    chrome = webdriver.Chrome(options=options, service=Service(driver))
+    chrome.set_page_load_timeout(120.0)
+    yield chrome
+    chrome.quit()

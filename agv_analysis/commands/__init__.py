@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from agv_analysis.analysis import Observations
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -27,3 +30,28 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
         path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def with_report(command: F) -> F:
+    """The options --report and --figures of commands that judge a run."""
+    command = click.option(
+        "--figures", type=click.Path(path_type=Path), help="Draw each plot to this directory, as SVG and PDF."
+    )(command)
+    return click.option("--report", type=click.Path(path_type=Path), help="Write a page for the browser to this file.")(
+        command
+    )
+
+
+def report_on(analysis: Observations, report: Path | None, figures: Path | None) -> None:
+    """Write what `with_report` asks for."""
+    if report is not None:
+        from agv_analysis.report.page import write_report
+
+        write_report(analysis, report)
+        click.echo(f"report:  {report}")
+    if figures is not None:
+        from agv_analysis.report.figures import draw_figures
+        from agv_analysis.report.panels import panels
+
+        draw_figures(panels(analysis), figures)
+        click.echo(f"figures: {figures}")

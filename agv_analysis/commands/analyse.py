@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from agv_analysis.commands import write_json
+from agv_analysis.commands import report_on, with_report, write_json
 
 
 @click.command("analyse")
@@ -22,10 +22,11 @@ from agv_analysis.commands import write_json
 @click.option("--reference-topic", help="Another robot's reference: Odometry or Path.")
 @click.option("--track-file", type=click.Path(path_type=Path), help="Another robot's reference: CSV file with t, v, w.")
 @click.option("--topics", type=click.Path(path_type=Path), help="YAML file with the topics: pose, command, reference.")
+@with_report
 def command(
     bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None,
     pose_topic: str | None, command_topic: str | None, reference_topic: str | None, track_file: Path | None,
-    topics: Path | None,
+    topics: Path | None, report: Path | None, figures: Path | None,
 ) -> None:  # fmt: skip
     """Say from the recording BAG whether the loop is stable, and why.
 
@@ -33,6 +34,7 @@ def command(
     Examples:
       agv-ncs analyse bags/first
       agv-ncs analyse bags/first --json first.json --picture first.png
+      agv-ncs analyse bags/first --report first.html --figures first
       agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
       agv-ncs analyse robot --pose-topic /odom --command-topic /cmd_vel --reference-topic /plan
     """
@@ -52,5 +54,6 @@ def command(
     draw(run, where)
     print_table(analysis)
     click.echo(f"bag:     {bag}\npicture: {where}")
+    report_on(analysis, report, figures)
     if json_file is not None:
         write_json(json_file, analysis.to_json())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from agv_analysis.commands import with_settings, write_json
+from agv_analysis.commands import report_on, with_report, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
@@ -18,7 +18,15 @@ if TYPE_CHECKING:
 @with_settings
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the run to this file, a row a step.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
-def command(params: str, settings: tuple[str, ...], csv_file: Path | None, json_file: Path | None) -> None:
+@with_report
+def command(
+    params: str,
+    settings: tuple[str, ...],
+    csv_file: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+    figures: Path | None,
+) -> None:
     """Simulate the loop of the params file PARAMS without ROS and say whether it is stable, and why.
 
     \b
@@ -38,6 +46,7 @@ def command(params: str, settings: tuple[str, ...], csv_file: Path | None, json_
     if csv_file is not None:
         write_csv(csv_file, run)
         click.echo(f"csv:     {csv_file}")
+    report_on(analysis, report, figures)
     if json_file is not None:
         write_json(json_file, analysis.to_json())
 

@@ -59,7 +59,7 @@ def command(
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
-    for name, value in _rows(found, scenario.plant.ts):
+    for name, value in rows(found, scenario.plant.ts):
         table.add_row(name, value)
     console.print(table)
     best = _best_gains(scenario)
@@ -95,7 +95,9 @@ def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Pa
     click.echo(f"map:     {csv_file}\npicture: {picture}")
 
 
-def _rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
+def rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
+    """Name and value of each margin, as text."""
+
     def told(value: float | None, name: str, text: str) -> str:
         reason = found.reasons.get(name)
         if value is None:

@@ -1,0 +1,75 @@
+"""Panels as figures for a paper: one column wide, SVG and PDF, with all letters in the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agv_analysis.report.panels import BARS, DOTS, DRIVEN, LIMIT, LOST, OTHER, REFERENCE, STEP, Line, Panel, thinned
+from agv_ros.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+WIDTH = 3.5
+"""Width of a column [inch]."""
+
+STYLE: Any = {
+    "font.size": 8.0,
+    "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,  # TrueType, whole: what journals ask for
+    "svg.fonttype": "path",  # letters as paths: no font is missing anywhere
+    "svg.hashsalt": "agv_ncs",  # the same bytes for the same run
+}
+
+COLOURS = {REFERENCE: "#7f7f7f", DRIVEN: "#1f6fb4", LOST: "#d62728", OTHER: "#e08214", LIMIT: "black"}
+
+_MOST_POINTS = 4000
+"""Points of a line: more than a printer can show in a column."""
+
+
+def draw_figures(panels: Iterable[Panel], folder: Path) -> list[Path]:
+    """Draw each panel to `folder`/<key>.svg and .pdf. Raises UserError if that cannot be written to."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    drawn = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for panel in panels:
+            with mpl.rc_context(STYLE):
+                figure = Figure(figsize=(WIDTH, WIDTH if panel.equal else 0.62 * WIDTH), layout="constrained")
+                _draw(figure.add_subplot(), panel)
+                for suffix, metadata in (("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+                    drawn.append(folder / f"{panel.key}.{suffix}")
+                    figure.savefig(drawn[-1], metadata=metadata)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written to: {error.strerror or error}") from None
+    return drawn
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    for line in panel.lines:
+        _draw_line(axes, thinned(line, _MOST_POINTS))
+    axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
+    if panel.log:
+        axes.set_yscale("log")
+    if panel.equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    if panel.y_range is not None:
+        axes.set_ylim(*panel.y_range)
+    axes.legend(fontsize=6.0, loc="upper right")
+
+
+def _draw_line(axes: Axes, line: Line) -> None:
+    colour = COLOURS[line.role]
+    if line.style == BARS:
+        axes.bar(line.x, line.y, color=colour, label=line.name)
+    elif line.style == DOTS:
+        axes.plot(line.x, line.y, ".", color=colour, ms=2.0, label=line.name, rasterized=len(line.x) > _MOST_POINTS)
+    elif line.style == STEP:
+        axes.step(line.x, line.y, where="post", color=colour, lw=0.6, label=line.name)
+    else:
+        dash = "--" if line.role == LIMIT else "-"
+        axes.plot(line.x, line.y, dash, color=colour, lw=0.6 if line.role == LIMIT else 0.9, label=line.name)

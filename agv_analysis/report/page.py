@@ -1,0 +1,152 @@
+"""The report: one HTML file that needs no network, the verdict first.
+
+Every string goes through the template's escaping, and what goes into a script is JSON in which no `<` is left. The
+page's own policy forbids it to load anything.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
+from agv_analysis.report.panels import TIME, Panel, panels, to_json
+from agv_analysis.report.plotly import MOST_POINTS, figure
+from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE
+from agv_analysis.version import version
+from agv_ros.errors import UserError
+
+_FEW = 2000
+"""Points of a line in the numbers that the page offers as JSON."""
+
+_HEIGHTS = {"time": 820}
+_HEIGHT = 460
+
+
+def sentence(analysis: Observations) -> str:
+    """The verdict in one sentence for people who do not know the criteria."""
+    if analysis.run.unexplained:
+        return "This recording proves nothing: messages are missing that no channel lost."
+    if not isinstance(analysis, Analysis):
+        return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
+    longest = f"{analysis.n} lost updates in a row ({analysis.n * analysis.run.ts * 1e3:g} ms)"
+    word = analysis.verdict.word
+    if word == ASYMPTOTIC and analysis.n == 0:
+        return "The AGV keeps to its track; no update was lost."
+    if word == ASYMPTOTIC:
+        return f"The AGV keeps to its track, whatever the order of outages as long as those seen: up to {longest}."
+    if word == MEAN_SQUARE:
+        return (
+            f"The AGV keeps to its track on a radio link like this one, but not in every case: outages of {longest}, "
+            "again and again, would throw it off."
+        )
+    if word == BOUNDED:
+        return f"The AGV does not settle on its track under outages of {longest}; only its speed limit keeps it near."
+    return f"The AGV does not keep to its track: outages of {longest} are too long for these gains."
+
+
+def write_report(analysis: Observations, path: Path) -> None:
+    """Write the report of a run. Raises UserError if it cannot be written or if plotly or jinja2 is not installed."""
+    text = render(analysis)
+    try:
+        path.write_text(text, encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def render(analysis: Observations) -> str:
+    """The report of a run as HTML. Raises UserError if plotly or jinja2 is not installed."""
+    try:
+        jinja2: Any = importlib.import_module("jinja2")
+        plotly: Any = importlib.import_module("plotly.offline")
+    except ImportError as error:
+        raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
+    source = Path(__file__).with_name("report.html.j2").read_text(encoding="utf-8")
+    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
+    drawn = list(panels(analysis))
+    text: str = template.render(
+        title=f"agv_ncs: {analysis.run.source}",
+        verdict=sentence(analysis),
+        word=analysis.verdict.word if isinstance(analysis, Analysis) and not analysis.run.unexplained else "unknown",
+        analysis=analysis,
+        run=analysis.run,
+        rows=list(_rows(analysis)),
+        margins=list(_margins(analysis)),
+        sections=list(_sections(drawn)),
+        parameters=analysis.run.scenario.to_yaml(),
+        versions=_versions(),
+        reproduce=_reproduce(analysis),
+        # Both are scripts, not text: the library, and JSON in which nothing can end a script.
+        library=plotly.get_plotlyjs(),
+        figures=_for_script({key: figure(group) for key, _, group in _groups(drawn)}),
+        data=_for_script(report_json(analysis, drawn)),
+    )
+    return text
+
+
+def report_json(analysis: Observations, drawn: list[Panel]) -> dict[str, Any]:
+    """All that the report shows, by name; its lines thinned to some thousand points."""
+    return {
+        "sentence": sentence(analysis),
+        "analysis": analysis.to_json(),
+        "versions": _versions(),
+        "parameters": analysis.run.scenario.to_yaml(),
+        "panels": {panel.key: to_json(panel, _FEW) for panel in drawn},
+    }
+
+
+def _for_script(content: Any) -> str:
+    """JSON that can stand in a script: nothing in it ends the script or begins a comment."""
+    text = json.dumps(content, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _groups(drawn: list[Panel]) -> Iterator[tuple[str, str, list[Panel]]]:
+    """Key, title and panels of each figure: those over time share one, whose axes are linked."""
+    over_time = [panel for panel in drawn if panel.x_label == TIME]
+    for panel in drawn:
+        if panel not in over_time:
+            yield panel.key, panel.title, [panel]
+        elif panel is over_time[0]:
+            yield "time", "Errors, speed, age of information", over_time
+
+
+def _sections(drawn: list[Panel]) -> Iterator[dict[str, Any]]:
+    for key, title, group in _groups(drawn):
+        longest = max(len(line.x) for panel in group for line in panel.lines)
+        yield {"key": key, "title": title, "height": _HEIGHTS.get(key, _HEIGHT), "thinned": longest > MOST_POINTS}
+
+
+def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
+    """The figures that the terminal shows, without its colours."""
+    from rich.text import Text
+
+    from agv_analysis.table import rows
+
+    for name, value in rows(analysis):
+        yield name, Text.from_markup(value).plain
+
+
+def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
+    from agv_analysis.commands.stability import rows
+    from agv_analysis.stability.margins import margins
+
+    if isinstance(analysis, Analysis) and analysis.run.scenario.error_detector.track_file == "":
+        yield from rows(margins(analysis.run.scenario), analysis.run.ts)
+
+
+def _versions() -> dict[str, str]:
+    return {"agv_ncs": version(), "Python": platform.python_version(), "numpy": np.__version__}
+
+
+def _reproduce(analysis: Observations) -> str:
+    """Commands that make this run anew; params.yaml are the parameters that the page shows."""
+    if analysis.run.source == "simulation":
+        return "agv-ncs simulate params.yaml --report report.html"
+    return "agv-ncs run params.yaml --bag bags/again\nagv-ncs analyse bags/again --report report.html"

@@ -1,0 +1,226 @@
+"""What a report draws: lines on axes, described once for the page and for the figures of a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.analysis import Analysis, Observations, paper_inputs
+from agv_analysis.convergence import TOLERANCE, body_errors, wrapped
+from agv_analysis.picture import SMALLEST, within
+from agv_analysis.run import Floats, Run
+from agv_analysis.stability import lifted, paper
+from agv_analysis.stability.linearisation import step_matrices
+
+TIME = "time [s]"
+
+LINE, STEP, DOTS, BARS = "line", "step", "dots", "bars"
+
+REFERENCE, DRIVEN, LOST, OTHER, LIMIT = "reference", "driven", "lost", "other", "limit"
+"""What a line stands for, which gives it its colour."""
+
+LARGEST_LIFTED = 600
+"""Multipliers of a larger lifted system are not computed: 3 (n + 1) of them take its cube in time."""
+
+_EIGENVALUE_STEPS = 400
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a panel; x and y of equal length, NaN where nothing is drawn."""
+
+    name: str
+    x: Floats
+    y: Floats
+    role: str
+    style: str = LINE
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A pair of axes with its lines."""
+
+    key: str
+    title: str
+    x_label: str
+    y_label: str
+    lines: tuple[Line, ...]
+    log: bool = False
+    equal: bool = False
+    """Is a metre (or a unit) as long up as across?"""
+    y_range: tuple[float, float] | None = None
+    """What is shown at first; None: everything."""
+
+
+def time_panels(run: Run) -> tuple[Panel, ...]:
+    """Errors, speed and age of the pose over time."""
+    return _distance(run), _body(run), _speed(run), _age(run)
+
+
+def panels(analysis: Observations) -> Iterator[Panel]:
+    """All panels of a run; those that need the controller's gains only where these are known."""
+    yield track(analysis.run)
+    yield from time_panels(analysis.run)
+    yield outage_lengths(analysis)
+    if isinstance(analysis, Analysis):
+        yield unit_circle(analysis)
+
+
+def track(run: Run, name: str = "AGV") -> Panel:
+    """The track from above, with the places where poses were lost."""
+    reference = run.reference[:, :2]
+    x, y = within(run.pose[:, 0], reference[:, 0]), within(run.pose[:, 1], reference[:, 1])
+    lines = (
+        Line("reference", reference[:, 0], reference[:, 1], REFERENCE),
+        Line(name, x, y, DRIVEN),
+        Line("pose lost", x[run.lost], y[run.lost], LOST, DOTS),
+    )
+    return Panel("track", "Track", "x [m]", "y [m]", lines[: 3 if run.lost.any() else 2], equal=True)
+
+
+def _distance(run: Run) -> Panel:
+    e = run.reference[:, :2] - run.pose[:, :2]
+    return Panel(
+        "distance",
+        "Error",
+        TIME,
+        "error [m]",
+        (
+            Line("distance", run.time, np.maximum(np.hypot(e[:, 0], e[:, 1]), SMALLEST), DRIVEN),
+            Line("|y_r - y_c|", run.time, np.maximum(np.abs(e[:, 1]), SMALLEST), OTHER),
+            _limit("1 cm", run, TOLERANCE),
+        ),
+        log=True,
+    )
+
+
+def _body(run: Run) -> Panel:
+    e = body_errors(run.reference, run.pose)
+    lines = (
+        Line("x_e along [m]", run.time, e[:, 0], DRIVEN),
+        Line("y_e across [m]", run.time, e[:, 1], OTHER),
+        Line("theta_e [rad]", run.time, wrapped(e[:, 2]), REFERENCE),
+    )
+    return Panel("errors", "Errors in the AGV's frame", TIME, "error [m, rad]", lines, y_range=_most(e))
+
+
+def _speed(run: Run) -> Panel:
+    lines = [
+        Line("v", run.time, run.command[:, 0], DRIVEN),
+        Line("v_r", run.time, run.reference[:, 3], REFERENCE),
+    ]
+    v_max = run.scenario.controller.v_max
+    if run.gains_known and np.isfinite(v_max):
+        lines += [_limit(name, run, limit) for name, limit in (("v_max", v_max), ("-v_max", -v_max))]
+    shown = _most(np.concatenate((run.command[:, 0], run.reference[:, 3])))
+    return Panel("speed", "Speed", TIME, "speed [m/s]", tuple(lines), y_range=shown)
+
+
+def _age(run: Run) -> Panel:
+    line = Line("n_ul", run.time, run.n_ul.astype(np.float64), LOST, STEP)
+    label = f"n_ul [{run.ts * 1e3:g} ms]"
+    return Panel("age", "Age of information: steps since the freshest pose that the edge holds", TIME, label, (line,))
+
+
+def _limit(name: str, run: Run, value: float) -> Line:
+    ends = run.time[[0, -1]]
+    return Line(name, ends, np.full(2, value), LIMIT)
+
+
+def _most(values: Floats) -> tuple[float, float] | None:
+    """A range that holds 98 % of the values and a margin: a start far from the track would flatten all the rest."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return None
+    low, high = np.percentile(finite, [1.0, 99.0])
+    margin = 0.25 * (high - low) + 1e-6
+    return float(low - margin), float(high + margin)
+
+
+def outage_lengths(analysis: Observations) -> Panel:
+    """How many outages of each length there were, and how many the fitted channel lets expect."""
+    up, fit = analysis.outages.uplink, analysis.fit
+    lengths = np.arange(1, max(1, up.longest) + 1, dtype=np.float64)
+    lines = [Line("seen", lengths, np.array([up.histogram.get(int(n), 0) for n in lengths], dtype=float), LOST, BARS)]
+    if 0.0 < fit.chain.loss_rate < 1.0 and fit.mean_burst >= 1.0:
+        ends = 1.0 / fit.mean_burst  # both models end an outage with the same probability in each slot
+        lines.append(Line(f"{fit.model} as fitted", lengths, up.count * ends * (1.0 - ends) ** (lengths - 1.0), DRIVEN))
+    return Panel("outages", "Outages of the uplink", "length [slots]", "how many", tuple(lines))
+
+
+def unit_circle(analysis: Analysis) -> Panel:
+    """The paper's eigenvalues along the run and the multipliers of the lifted system, on the unit circle."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    eigenvalues, multipliers = paper_eigenvalues(analysis.run), lifted_multipliers(analysis)
+    lines = (
+        Line("|z| = 1", np.cos(angle), np.sin(angle), LIMIT),
+        Line("lifted system", multipliers.real, multipliers.imag, LOST, DOTS),
+        Line("paper's A(k)", eigenvalues.real, eigenvalues.imag, DRIVEN, DOTS),
+    )
+    title = f"Eigenvalues: the paper's along the run, the lifted system's for a pose always {analysis.n} steps old"
+    return Panel("eigenvalues", title, "Re", "Im", lines, equal=True)
+
+
+def paper_eigenvalues(run: Run) -> NDArray[np.complex128]:
+    """Eigenvalues of A(k) (eq. 55) at up to 400 steps of a run, evenly spread, shape (M,); none where it diverged."""
+    some = np.unique(np.linspace(0, len(run) - 1, _EIGENVALUE_STEPS).astype(np.int64))
+    theta, theta_held, v_held = (values[some] for values in paper_inputs(run))
+    matrices = paper.matrices(theta, theta_held, v_held, run.scenario.controller, run.ts)
+    usable = np.isfinite(matrices).all(axis=(1, 2))
+    return np.asarray(np.linalg.eigvals(matrices[usable]).ravel(), dtype=np.complex128)
+
+
+def lifted_multipliers(analysis: Analysis) -> NDArray[np.complex128]:
+    """Eigenvalues of the lifted system at the speeds where it is worst, shape (3 (n + 1),); none if it is too large.
+
+    e(k+1) = F e(k) + G e(k-n) as a block companion matrix of [e(k), .., e(k-n)].
+    """
+    run, n = analysis.run, analysis.n
+    size = 3 * (n + 1)
+    if size > LARGEST_LIFTED:
+        return np.empty(0, dtype=np.complex128)
+    gains = run.scenario.controller
+    v, w = lifted.distinct_speeds(run.reference[:, 3], run.reference[:, 4])
+    worst = int(np.argmax(lifted.spectral_radii(n, v, w, gains, run.ts)))
+    F, G = step_matrices(v[[worst]], w[[worst]], gains, run.ts)
+    companion = np.eye(size, k=-3)
+    companion[:3] = 0.0
+    companion[:3, :3] += F[0]
+    companion[:3, -3:] += G[0]
+    return np.asarray(np.linalg.eigvals(companion), dtype=np.complex128)
+
+
+def thinned(line: Line, most: int) -> Line:
+    """A line of about `most` points at most, which keeps the lowest and the highest of each stretch.
+
+    So no peak is lost, however far one zooms out; with `most` pixels the picture is the same.
+    """
+    if len(line.x) <= most:
+        return line
+    stretches = max(1, most // 2)
+    edges = np.linspace(0, len(line.x), stretches + 1).astype(np.int64)[:-1]
+    width = np.diff(np.append(edges, len(line.x)))
+    stretch = np.repeat(np.arange(stretches), width)
+    lowest = np.lexsort((np.where(np.isnan(line.y), np.inf, line.y), stretch))[edges]
+    highest = np.lexsort((np.where(np.isnan(line.y), np.inf, -line.y), stretch))[edges]
+    kept = np.unique(np.concatenate((lowest, highest, [0, len(line.x) - 1])))
+    return replace(line, x=line.x[kept], y=line.y[kept])
+
+
+def to_json(panel: Panel, most: int) -> dict[str, Any]:
+    """A panel's lines by name, for who wants the numbers; null where nothing is drawn."""
+    lines = [thinned(line, most) for line in panel.lines]
+    return {
+        "title": panel.title,
+        "x": panel.x_label,
+        "y": panel.y_label,
+        "lines": {line.name: {"x": _plain(line.x), "y": _plain(line.y)} for line in lines},
+    }
+
+
+def _plain(values: Floats) -> list[float | None]:
+    return [float(f"{value:.7g}") if np.isfinite(value) else None for value in values.tolist()]

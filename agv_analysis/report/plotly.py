@@ -1,0 +1,80 @@
+"""Panels as figures of plotly.js: plain dictionaries, as they go into its JSON."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.report.panels import BARS, DOTS, DRIVEN, LIMIT, LOST, OTHER, REFERENCE, STEP, Line, Panel, thinned
+from agv_analysis.run import Floats
+
+COLOURS = {REFERENCE: "#8a8a8a", DRIVEN: "#3b8bd0", LOST: "#e0453c", OTHER: "#e39a2d", LIMIT: "#8a8a8a"}
+"""Each is seen on white and on black."""
+
+MOST_POINTS = 40_000
+"""Points of one line in a report; longer runs are thinned."""
+
+_GAP = 0.22
+"""Share of a row that is left free above it, for its legend."""
+
+
+def figure(panels: Sequence[Panel], most: int = MOST_POINTS, webgl: bool = True, revision: str = "") -> dict[str, Any]:
+    """A figure of panels one below the other on one common x axis, which zooms all of them."""
+    rows = len(panels)
+    traces: list[dict[str, Any]] = []
+    layout: dict[str, Any] = {
+        "margin": {"l": 60, "r": 12, "t": 8, "b": 44},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "modebar": {"bgcolor": "rgba(0,0,0,0)"},
+        "hovermode": "closest" if panels[0].equal else "x",
+        "uirevision": revision or panels[0].key,
+        "xaxis": {
+            "title": {"text": panels[0].x_label}, "anchor": f"y{rows if rows > 1 else ''}", "zeroline": False,
+        },
+    }  # fmt: skip
+    for row, panel in enumerate(panels):
+        number = str(row + 1) if row else ""
+        top = 1.0 - row / rows - (_GAP / rows if rows > 1 else 0.0)
+        bottom = 1.0 - (row + 1) / rows
+        layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel)}
+        layout[f"legend{number}"] = {"orientation": "h", "x": 0.0, "y": top, "yanchor": "bottom"}
+        traces += [
+            {**_trace(thinned(line, most), webgl), "yaxis": f"y{number}", "legend": f"legend{number}"}
+            for line in panel.lines
+        ]
+    return {"data": traces, "layout": layout}
+
+
+def _y_axis(panel: Panel) -> dict[str, Any]:
+    axis: dict[str, Any] = {"title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "power"}
+    if panel.log:
+        axis["type"] = "log"
+    if panel.equal:
+        axis |= {"scaleanchor": "x", "scaleratio": 1}
+    if panel.y_range is not None:
+        axis["range"] = list(panel.y_range)
+    return axis
+
+
+def _trace(line: Line, webgl: bool) -> dict[str, Any]:
+    colour = COLOURS[line.role]
+    trace: dict[str, Any] = {"name": line.name, "x": _packed(line.x), "y": _packed(line.y), "showlegend": True}
+    if line.style == BARS:
+        return {**trace, "type": "bar", "marker": {"color": colour}}
+    trace["type"] = "scattergl" if webgl and len(line.x) > 1000 else "scatter"
+    if line.style == DOTS:
+        return {**trace, "mode": "markers", "marker": {"color": colour, "size": 4}}
+    dash = {"dash": "dash"} if line.role == LIMIT else {}
+    shape = {"shape": "hv"} if line.style == STEP else {}
+    return {**trace, "mode": "lines", "line": {"color": colour, "width": 1.5, **dash, **shape}}
+
+
+def _packed(values: Floats) -> dict[str, str]:
+    """Numbers as plotly.js takes them in binary, in single precision, which is finer than a pixel."""
+    largest = float(np.finfo(np.float32).max)
+    single = np.clip(values, -largest, largest).astype("<f4")
+    return {"dtype": "f4", "bdata": base64.b64encode(single.tobytes()).decode("ascii")}
