@@ -264,7 +264,7 @@ def test_the_command_writes_everything(made: Made) -> None:
     assert made.content["source"] == "simulation"
     for suffix in ("svg", "png", "csv"):
         assert len(list(made.folder.glob(f"*.{suffix}"))) == 8
-    assert (made.folder / "future.md").read_text().count("###") == len(made.content["future_work"]) == 7
+    assert (made.folder / "future.md").read_text().count("###") == len(made.content["future_work"]) == 9
 
 
 def test_a_directory_that_cannot_be_made_is_one_line(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
@@ -340,3 +340,19 @@ def test_outages_never_help(made: Made) -> None:
             rows[-1][f"K_x = {kx:g} [m s]"] is None or rows[-1][f"K_x = {kx:g} [m s]"] > rows[0][f"K_x = {kx:g} [m s]"]
         )
     assert [row["K_x = 250 part"] for row in rows[:1] + rows[-2:]] == [0.0, 1.0, 1.0]
+
+
+def test_only_the_predictor_survives_200_outages_in_a_row(made: Made) -> None:
+    rows = [row for row in made.future("staleness_policies") if row["uplink"] == "200 after each received"]
+    assert [row["policy"] for row in rows if row["twins part"] == 0.0] == ["predict", "predict"]
+    exact, scaled = (row["farthest from the reference [m]"] for row in rows if row["policy"] == "predict")
+    assert exact == 0.0
+    assert scaled == pytest.approx(0.1 * 1.5 * 200 * 0.005, rel=0.15)  # delta v_r n T_s where v_r is largest
+
+
+def test_aligned_poses_have_no_bias(made: Made) -> None:
+    """Held ones run ahead by v_r n T_s; both where the loop is stable."""
+    rows = [row for row in made.future("staleness_policies") if row["uplink"] == "13 after each received"]
+    by_policy = {row["policy"]: row["farthest from the reference [m]"] for row in rows if row["speed scale"] == 1.0}
+    assert by_policy["align"] == 0.0
+    assert by_policy["hold"] > 0.01

@@ -12,20 +12,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from agv_analysis.convergence import convergence
-from agv_analysis.reproduce import outdated
+from agv_analysis.reproduce import outdated, policies
 from agv_analysis.reproduce.claim import Values
 from agv_analysis.reproduce.claims import LIMITS, ON_TRACK
+from agv_analysis.reproduce.policies import CLOSER, SEEDS
 from agv_analysis.reproduce.report import Table
 from agv_analysis.reproduce.runs import GAINS, gain, scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.batch import cores
 from agv_analysis.stability import bursts, lifted, mean_square, paper
 from agv_cloud.reference import Reference
-
-SEEDS = range(1, 21)
-
-CLOSER = 0.5
-"""Twins have come closer if a lap at least halves their distance; an error that only stays does not do that."""
 
 
 def tables() -> Iterator[Table]:
@@ -41,6 +37,12 @@ def tables() -> Iterator[Table]:
     yield Table("mean_burst", "20 % of the poses lost, by mean burst: the same", _mean_bursts())
     yield Table("single_burst", "One burst, from step 1 on: steps from 5 m to 2 %, overshoot", _single_bursts())
     yield Table("limit", "K_x = 25, n lost after each received pose: what a limit on |v| makes of it", _limits())
+    yield Table(
+        "staleness_policies",
+        "K_x = 25 on the track, one lap: staleness policies on the same outages",
+        [*policies.edge()],
+    )
+    yield Table("downlink_policies", "The same for outages of the downlink", [*policies.downlink()])
     yield Table("criteria", "Largest n that is stable, by criterion and by twins driven for a lap", _criteria())
 
 
