@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from agv_analysis.convergence import wrapped
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, parse_scenario
-from agv_analysis.simulation.loop import answer, at_rest
+from agv_analysis.simulation.loop import answer, at_rest, received
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.reference import Reference
+from agv_cloud.staleness import Posture, Prediction
+from agv_plant.unicycle import STEPS
 from agv_ros.errors import UserError
 
 TOLERANCE = 1e-9
@@ -102,8 +104,17 @@ def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
     settings, reference = settings_of(scenario), Reference(scenario.error_detector)
     held, there = _held(run)
     rows = np.full((len(run), 5), np.nan)
+    predicts = scenario.error_detector.policy == "predict"
+    prediction = Prediction(STEPS[scenario.error_detector.integration], run.ts)
     for i in np.flatnonzero(there).tolist():
-        rows[i] = answer(at_rest(*run.pose[held[i]].tolist()), *reference[int(run.k[i])], settings)
+        k, taken = int(run.k[i]), int(run.k[held[i]])
+        pose = Posture(*run.pose[held[i]].tolist())
+        if predicts:
+            pose = prediction.at(k, taken, pose)
+        at_edge = received(at_rest(*pose), *pose, *reference[taken][:3], k - taken)
+        rows[i] = answer(at_edge, *reference[k], settings)
+        if predicts and np.isfinite(run.command[i]).all():
+            prediction.add_command(k, *run.command[i].tolist())
     return rows[:, :3], rows[:, 3:]
 
 

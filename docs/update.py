@@ -10,7 +10,8 @@ import tempfile
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[1]
-BEGIN, END = "<!-- demo:begin -->\n", "<!-- demo:end -->"
+DEMO = "<!-- demo:begin -->\n", "<!-- demo:end -->"
+RANKING = "<!-- ranking:begin -->\n", "<!-- ranking:end -->"
 
 
 def command(*arguments: str) -> str:
@@ -44,16 +45,31 @@ def paper_page(out: str) -> str:
     )
 
 
+def policies_page() -> str:
+    """docs/policies.md with its ranking made anew."""
+    from agv_analysis.reproduce.future import policy_tables
+    from agv_analysis.reproduce.report import table_markdown
+
+    text = (REPOSITORY / "docs/policies.md").read_text(encoding="utf-8")
+    return between(*RANKING, "\n".join(map(table_markdown, policy_tables())), text)
+
+
+def between(begin: str, end: str, block: str, text: str) -> str:
+    """`text` with another block between two marks."""
+    pattern = f"{re.escape(begin)}.*?(?={re.escape(end)})"
+    return re.sub(pattern, lambda _: begin + block, text, flags=re.DOTALL)
+
+
 def demo_block(analysed: str) -> str:
     """The part of README.md that shows what the demo prints, from what `analyse` printed; paths are the demo's."""
     table = "\n".join(line.rstrip() for line in re.split(r"\nbag: ", analysed)[0].splitlines())
-    return f"{BEGIN}```\n{table}\nbag:     bags/demo\npicture: bags/demo/overview.png\n```\n"
+    return f"```\n{table}\nbag:     bags/demo\npicture: bags/demo/overview.png\n```\n"
 
 
 def readme_with(block: str) -> str:
     """README.md with another demo block."""
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    return re.sub(re.escape(BEGIN) + ".*?(?=" + re.escape(END) + ")", lambda _: block, text, flags=re.DOTALL)
+    return between(*DEMO, block, text)
 
 
 def main() -> None:
@@ -64,6 +80,7 @@ def main() -> None:
         analysed = command("analyse", bag, "--picture", "docs/images/demo.png")
     with tempfile.TemporaryDirectory() as folder:
         (REPOSITORY / "docs/paper.md").write_text(paper_page(folder), encoding="utf-8")
+    (REPOSITORY / "docs/policies.md").write_text(policies_page(), encoding="utf-8")
     (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
     (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")
 

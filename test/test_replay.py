@@ -176,3 +176,12 @@ def test_the_command_s_errors_are_one_line(agv_ncs: AgvNcs, tmp_path: Path) -> N
     status, said = agv_ncs("replay", tmp_path / "none", "--compare")
     assert status == 1
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("policy", ["align", "predict"])
+def test_an_edge_with_a_staleness_policy_gives_the_same_answers_again(drive: Drive, policy: str) -> None:
+    run = drive(f"error_detector.policy={policy}", "plant.duration=2.0", "plant.speed_scale=1.05", config="outages")
+    assert run.n_ul.max() > 3
+    found = compare(run, run.scenario)
+    assert found.error.first is None
+    assert found.command.first is None

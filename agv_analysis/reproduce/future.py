@@ -37,13 +37,15 @@ def tables() -> Iterator[Table]:
     yield Table("mean_burst", "20 % of the poses lost, by mean burst: the same", _mean_bursts())
     yield Table("single_burst", "One burst, from step 1 on: steps from 5 m to 2 %, overshoot", _single_bursts())
     yield Table("limit", "K_x = 25, n lost after each received pose: what a limit on |v| makes of it", _limits())
-    yield Table(
-        "staleness_policies",
-        "K_x = 25 on the track, one lap: staleness policies on the same outages",
-        [*policies.edge()],
-    )
-    yield Table("downlink_policies", "The same for outages of the downlink", [*policies.downlink()])
+    yield from policy_tables()
     yield Table("criteria", "Largest n that is stable, by criterion and by twins driven for a lap", _criteria())
+
+
+def policy_tables() -> Iterator[Table]:
+    """Policies for outages, ranked."""
+    title = "K_x = 25 on the track, one lap: staleness policies on the same outages"
+    yield Table("staleness_policies", title, [*policies.edge()])
+    yield Table("downlink_policies", "The same for outages of the downlink", [*policies.downlink()])
 
 
 # -- gains -------------------------------------------------------------------------------------------------------------
