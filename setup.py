@@ -46,11 +46,14 @@ setup(
     extras_require={
         # ROS 2 Jazzy's rclpy with Fast DDS from PyPI, for machines where no ROS is installed.
         "ros": ["ros-jazzy-rclpy>=7.1.6", "ros-rclpy[fastrtps]>=7.1.6", "ros-jazzy-common-interfaces>=5.3.6"],
+        # The page of `agv-ncs explore`.
+        "explore": ["dash>=3.0"],
         # Sweeps on a Dask cluster, and results as Parquet.
         "cluster": ["distributed>=2023.1"],
         "parquet": ["pyarrow>=12.0"],
         "test": [
             "colcon-common-extensions",
+            "dash>=3.0",
             "distributed>=2023.1",
             "hypothesis>=6.80",
             "mcap-ros2-support>=0.5",

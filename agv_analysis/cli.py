@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-COMMANDS = ("run", "analyse", "stability", "parameters", "simulate", "sweep", "bag", "replay", "reproduce")
+COMMANDS = ("run", "analyse", "stability", "parameters", "simulate", "explore", "sweep", "bag", "replay", "reproduce")
 
 
 class _Group(click.Group):

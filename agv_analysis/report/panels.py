@@ -58,7 +58,7 @@ class Panel:
 
 def time_panels(run: Run) -> tuple[Panel, ...]:
     """Errors, speed and age of the pose over time."""
-    return _distance(run), _body(run), _speed(run), _age(run)
+    return distance(run), frame_errors(run), speed(run), age(run)
 
 
 def panels(analysis: Observations) -> Iterator[Panel]:
@@ -70,19 +70,20 @@ def panels(analysis: Observations) -> Iterator[Panel]:
         yield unit_circle(analysis)
 
 
-def track(run: Run, name: str = "AGV") -> Panel:
+def track(run: Run) -> Panel:
     """The track from above, with the places where poses were lost."""
     reference = run.reference[:, :2]
     x, y = within(run.pose[:, 0], reference[:, 0]), within(run.pose[:, 1], reference[:, 1])
     lines = (
         Line("reference", reference[:, 0], reference[:, 1], REFERENCE),
-        Line(name, x, y, DRIVEN),
+        Line("AGV", x, y, DRIVEN),
         Line("pose lost", x[run.lost], y[run.lost], LOST, DOTS),
     )
     return Panel("track", "Track", "x [m]", "y [m]", lines[: 3 if run.lost.any() else 2], equal=True)
 
 
-def _distance(run: Run) -> Panel:
+def distance(run: Run) -> Panel:
+    """Distance between AGV and reference, on a logarithmic axis."""
     e = run.reference[:, :2] - run.pose[:, :2]
     return Panel(
         "distance",
@@ -98,7 +99,8 @@ def _distance(run: Run) -> Panel:
     )
 
 
-def _body(run: Run) -> Panel:
+def frame_errors(run: Run) -> Panel:
+    """The true errors in the AGV's frame."""
     e = body_errors(run.reference, run.pose)
     lines = (
         Line("x_e along [m]", run.time, e[:, 0], DRIVEN),
@@ -108,7 +110,8 @@ def _body(run: Run) -> Panel:
     return Panel("errors", "Errors in the AGV's frame", TIME, "error [m, rad]", lines, y_range=_most(e))
 
 
-def _speed(run: Run) -> Panel:
+def speed(run: Run) -> Panel:
+    """Commanded speed, the reference's, and the limits."""
     lines = [
         Line("v", run.time, run.command[:, 0], DRIVEN),
         Line("v_r", run.time, run.reference[:, 3], REFERENCE),
@@ -120,7 +123,8 @@ def _speed(run: Run) -> Panel:
     return Panel("speed", "Speed", TIME, "speed [m/s]", tuple(lines), y_range=shown)
 
 
-def _age(run: Run) -> Panel:
+def age(run: Run) -> Panel:
+    """Age of the freshest pose that the edge holds."""
     line = Line("n_ul", run.time, run.n_ul.astype(np.float64), LOST, STEP)
     label = f"n_ul [{run.ts * 1e3:g} ms]"
     return Panel("age", "Age of information: steps since the freshest pose that the edge holds", TIME, label, (line,))

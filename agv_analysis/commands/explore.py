@@ -1,0 +1,32 @@
+"""`agv-ncs explore`: a page on this machine for questions that begin with what if."""
+
+from __future__ import annotations
+
+import click
+
+from agv_analysis.commands import with_settings
+
+
+@click.command("explore")
+@with_settings
+@click.option("--port", type=click.IntRange(0, 65535), default=8050, show_default=True, help="0: any free one.")
+@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+def command(params: str, settings: tuple[str, ...], port: int, no_browser: bool) -> None:
+    """Explore the params file PARAMS in the browser: every move of a slider simulates the lap anew. Ctrl-C ends it.
+
+    \b
+    Examples:
+      agv-ncs explore config/paper.yaml
+      agv-ncs explore config/outages.yaml --set controller.v_max=6.0 --port 9000 --no-browser
+    """
+    from agv_analysis.explore.app import serve
+    from agv_analysis.scenario import load_scenario
+
+    def ready(address: str) -> None:
+        click.echo(f"explore: {address} (Ctrl-C ends it)")
+        if not no_browser:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    serve(load_scenario(params, settings), port, ready)

@@ -1,0 +1,109 @@
+"""What the explorer answers to a setting: the lap simulated anew, as figures, and what it tells, as text."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agv_analysis.outages import outages
+from agv_analysis.report.panels import LIMIT, OTHER, REFERENCE, Panel, age, distance, speed, track
+from agv_analysis.report.plotly import figure
+from agv_analysis.run import Run
+from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.single import simulate
+from agv_analysis.stability import bursts, lifted, mean_square, paper
+from agv_analysis.stability.margins import binding
+
+_MOST_POINTS = 2000
+"""Points of a line: about two a pixel."""
+
+_PLACES = 100
+"""Places of the track at which the lifted system is asked: all of them would take longer than the lap."""
+
+_kept = functools.lru_cache(maxsize=4)(simulate)
+"""The pinned run does not change while another setting is moved."""
+
+
+class Answer(NamedTuple):
+    """What the page shows."""
+
+    track: dict[str, Any]
+    time: dict[str, Any]
+    rows: list[tuple[str, str, str]]
+    """Name, value, and that of the pinned setting, empty without one."""
+
+
+def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
+    """Simulate a scenario and, beside it, a pinned one that meets the same outages. Raises UserError as `simulate`."""
+    run = simulate(scenario)
+    other = None if pinned is None else _kept(under_the_outages_of(pinned, scenario))
+    first = beside(track(run), None if other is None else track(other))
+    over_time = [beside(panel(run), None if other is None else panel(other)) for panel in (distance, speed, age)]
+    values = list(told(run))
+    others = [""] * len(values) if other is None else [value for _, value in told(other)]
+    return Answer(
+        track=figure([first], _MOST_POINTS, webgl=False),
+        time=figure(over_time, _MOST_POINTS, webgl=False),
+        rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
+    )
+
+
+def under_the_outages_of(pinned: Scenario, scenario: Scenario) -> Scenario:
+    """The pinned scenario on the channel, and with the seed, of another one: slot by slot the same is lost."""
+    shared = ("ts", "start_time", "wait_for_subscribers", "stop_timeout")
+    own = {name: getattr(pinned.relay, name) for name in shared}
+    return dataclasses.replace(pinned, relay=dataclasses.replace(scenario.relay, **own))
+
+
+def beside(panel: Panel, pinned: Panel | None) -> Panel:
+    """A panel with the first line of another run's in it that is neither reference nor limit."""
+    shown = tuple(line for line in panel.lines if line.role != OTHER)
+    if pinned is not None:
+        line = next(line for line in pinned.lines if line.role not in (REFERENCE, LIMIT))
+        shown += (dataclasses.replace(line, name="pinned", role=OTHER),)
+    return dataclasses.replace(panel, lines=shown)
+
+
+def told(run: Run) -> Iterator[tuple[str, str]]:
+    """What a run tells, and the margins that are computed at once: those of a straight track in closed form."""
+    gains, ts, n = run.scenario.controller, run.ts, outages(run).n_ul_max
+    e = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
+    late = float(e[-max(1, len(e) // 10) :].max())
+    yield "Error in the last tenth", "; ".join((f"at most {late:.3g} m", *run.notes))
+    yield "Oldest pose", f"{n} steps ({n * ts * 1e3:g} ms)"
+    yield "Paper's test", _of_paper(run)
+    v, w = run.reference[:, 3], run.reference[:, 4]
+    if run.scenario.error_detector.policy == "predict":
+        yield "Pose always that old", "predicted: with an exact model as without outages"
+    else:
+        some = np.linspace(0, len(v) - 1, _PLACES).astype(np.int64)
+        radius = lifted.largest_radius(n, v[some], w[some], gains, ts)
+        yield "Pose always that old", f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
+    top = float(np.abs(v).max())
+    along, across = bursts.largest_n_along(ts * gains.kx), bursts.largest_n_across(top, gains, ts)
+    yield "Straight track, any outages", f"up to {_n(along)} along, {_n(across)} across"
+    delay = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(top, gains, ts))
+    yield "Straight track, delay", f"below {delay * ts * 1e3:.4g} ms" if delay > 0.0 else "none"
+    loss = mean_square.critical_loss_along(ts * gains.kx)
+    yield "Independent losses, mean square", f"below {loss:.4g}" if loss > 0.0 else "none"
+    binds = binding(top, gains, ts)
+    yield "What binds", "nothing" if binds is None else f"the error {binds} the track"
+
+
+def _of_paper(run: Run) -> str:
+    """The largest n for which the paper's test holds on the track as far as it was driven."""
+    theta, v_r = run.reference[:, 2], run.reference[:, 3]
+    n = paper.largest_n(theta, v_r, run.scenario.controller, run.ts)
+    if n is None:
+        return "holds for any number of outages"
+    return "fails even without outages" if n < 0 else f"holds for up to {n} outages in a row"
+
+
+def _n(steps: int | None) -> str:
+    if steps is None:
+        return "any number"
+    return "none" if steps < 0 else str(steps)

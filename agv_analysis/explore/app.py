@@ -1,0 +1,151 @@
+"""The explorer's page, made with Dash: it listens on 127.0.0.1 alone and loads nothing from elsewhere."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+from agv_analysis.explore.answer import Answer, answer
+from agv_analysis.explore.settings import CHOICES, PRESETS, SLIDERS, preset_values, scenario_of, values_of
+from agv_analysis.scenario import Scenario
+from agv_ros.errors import UserError
+
+HOST = "127.0.0.1"
+
+KEYS = (*(slider.key for slider in SLIDERS), *CHOICES, "more")
+"""Everything on the page that can be set, in the order in which it comes to a callback."""
+
+STYLE = """
+body { margin: 0; font: 15px/1.4 system-ui, sans-serif; color: #1b1f24; background: #fff }
+main { display: flex; flex-wrap: wrap; gap: 1rem; padding: 1rem; max-width: 1400px; margin: auto }
+#controls { flex: 1 1 300px; max-width: 420px } #shown { flex: 3 1 560px; min-width: 0 }
+#problem { color: #cf222e; min-height: 1.4em; white-space: pre-wrap } h1 { font-size: 1.2rem; margin: 0 0 .5rem }
+label { display: block; font-size: .85rem; color: #5b6570; margin-top: .3rem }
+button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
+th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
+pre { white-space: pre-wrap }
+"""
+
+
+def build(base: Scenario) -> Any:
+    """The page as a Dash app. Raises UserError if Dash is not installed."""
+    try:
+        dash: Any = importlib.import_module("dash")
+    except ImportError:
+        raise UserError("the explorer needs Dash: pip install dash") from None
+    app = dash.Dash("agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets")
+    app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
+    app.layout = _layout(dash, values_of(base))
+    _connect(dash, app, base)
+    return app
+
+
+def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
+    html, dcc = dash.html, dash.dcc
+    controls = [html.H1("What if?")]
+    controls += [html.Button(preset.title, id=f"preset-{key}") for key, preset in PRESETS.items()]
+    controls.append(html.P("", id="story"))
+    for key, (label, names) in CHOICES.items():
+        controls += [html.Label(label), dcc.Dropdown(list(names), at_first[key], id=key, clearable=False)]
+    for slider in SLIDERS:
+        controls += [html.Label(slider.label), _slider(dcc, slider, at_first[slider.key])]
+    example = "further settings, one a line:\nplant.duration=50.0\nrelay.downlink.model=bernoulli"
+    controls += [html.Label("more"), dcc.Textarea(id="more", value="", placeholder=example, rows=3)]
+    shown = [
+        html.Div(
+            [
+                html.Button("Pin this setting", id="pin"),
+                html.Button("Unpin", id="unpin"),
+                html.Button("Export", id="export"),
+            ]
+        ),
+        html.Div("", id="problem", role="alert"),
+        html.Table([], id="told"),
+        dcc.Graph(id="plot-track", style={"height": "420px"}, config={"displaylogo": False}),
+        dcc.Graph(id="plot-time", style={"height": "620px"}, config={"displaylogo": False}),
+        html.Pre("", id="exported"),
+        dcc.Download(id="file"),
+        dcc.Store(id="pinned"),
+    ]
+    return html.Main([html.Div(controls, id="controls"), html.Div(shown, id="shown")])
+
+
+def _slider(dcc: Any, slider: Any, value: float) -> Any:
+    ends = {end: f"{end:g}" for end in (slider.low, slider.high)}
+    return dcc.Slider(slider.low, slider.high, slider.step, value=value, marks=ends, id=slider.key, updatemode="drag")
+
+
+def _connect(dash: Any, app: Any, base: Scenario) -> None:
+    Input, Output, State = dash.Input, dash.Output, dash.State
+    inputs, states = [Input(key, "value") for key in KEYS], [State(key, "value") for key in KEYS]
+
+    def values(given: tuple[Any, ...]) -> dict[str, Any]:
+        return dict(zip(KEYS, given, strict=True))
+
+    @app.callback(
+        Output("plot-track", "figure"), Output("plot-time", "figure"), Output("told", "children"),
+        Output("problem", "children"),
+        *inputs, Input("pinned", "data"),
+    )  # fmt: skip
+    def move(*given: Any) -> Any:
+        *settings, pinned = given
+        try:
+            other = None if pinned is None else scenario_of(base, pinned)
+            found = answer(scenario_of(base, values(tuple(settings))), other)
+        except UserError as error:
+            return dash.no_update, dash.no_update, dash.no_update, str(error)
+        return found.track, found.time, _told(dash.html, found), ""
+
+    @app.callback(
+        Output("pinned", "data"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"), *states,
+        prevent_initial_call=True,
+    )  # fmt: skip
+    def pin(_: Any, __: Any, *given: Any) -> Any:
+        return values(given) if dash.ctx.triggered_id == "pin" else None
+
+    @app.callback(
+        *(Output(key, "value") for key in KEYS), Output("story", "children"),
+        *(Input(f"preset-{key}", "n_clicks") for key in PRESETS), prevent_initial_call=True,
+    )  # fmt: skip
+    def preset(*_: Any) -> Any:
+        key = dash.ctx.triggered_id.removeprefix("preset-")
+        chosen = preset_values(base, key)
+        return *(chosen[name] for name in KEYS), PRESETS[key].text
+
+    @app.callback(
+        Output("exported", "children"), Output("file", "data"), Input("export", "n_clicks"), *states,
+        prevent_initial_call=True,
+    )  # fmt: skip
+    def export(_: Any, *given: Any) -> Any:
+        try:
+            text = scenario_of(base, values(given)).to_yaml()
+        except UserError as error:
+            return str(error), dash.no_update
+        command = "agv-ncs simulate explored.yaml --report explored.html"
+        return f"{command}\n\n# explored.yaml\n{text}", {"content": text, "filename": "explored.yaml"}
+
+
+def _told(html: Any, found: Answer) -> list[Any]:
+    return [html.Tr([html.Th(name), html.Td(value), html.Td(other)]) for name, value, other in found.rows]
+
+
+def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
+    """Serve the page until Ctrl-C; `ready` is told its address. Port 0: any free one.
+
+    Raises UserError if the port is taken or Dash is not installed.
+    """
+    app = build(base)
+    werkzeug: Any = importlib.import_module("werkzeug.serving")
+    quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), {"log": lambda *_: None})
+    try:
+        server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet)
+    except (OSError, SystemExit) as error:
+        raise UserError(f"port {port} of {HOST} cannot be used: {error}: choose another with --port") from None
+    try:
+        ready(f"http://{HOST}:{server.server_port}/")
+        server.serve_forever()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.server_close()

@@ -1,0 +1,161 @@
+"""The settings that the explorer's page shows, and the scenario that they make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from agv_analysis.scenario import Scenario, parse_scenario
+from agv_cloud.staleness import POLICIES
+from agv_cloud.tracks import TRACKS
+from agv_plant.channels import MODELS
+
+
+@dataclass(frozen=True)
+class Slider:
+    """One slider: what it is called, which values it takes."""
+
+    key: str
+    label: str
+    low: float
+    high: float
+    step: float
+
+
+NO_LIMIT = 20.0
+"""At this end of its slider v_max is no limit."""
+
+SLIDERS = (
+    Slider("kx", "K_x [1/s]", 0.0, 400.0, 1.0),
+    Slider("ky", "K_y [1/m^2]", 0.0, 20.0, 0.1),
+    Slider("ktheta", "K_theta [1/m]", 0.0, 20.0, 0.1),
+    Slider("ts", "T_s [ms]", 1.0, 50.0, 1.0),
+    Slider("v_max", f"v_max [m/s], {NO_LIMIT:g}: none", 0.5, NO_LIMIT, 0.5),
+    Slider("ahead", "starts ahead by [m]", -10.0, 10.0, 0.5),
+    Slider("left", "starts to the left by [m]", -5.0, 5.0, 0.1),
+    Slider("p", "channel: p", 0.0, 1.0, 0.005),
+    Slider("r", "channel: r", 0.0, 1.0, 0.01),
+    Slider("n", "burst: n lost after each received", 0.0, 60.0, 1.0),
+    Slider("seed", "seed of the outages", 1.0, 100.0, 1.0),
+)
+
+CHOICES = {"model": ("channel", tuple(MODELS)), "policy": ("policy", POLICIES), "track": ("track", tuple(TRACKS))}
+"""Drop-down lists by key: label and what there is to choose from."""
+
+Values = Mapping[str, Any]
+"""Value by key of each slider and list, and the text `more` of further settings, one a line."""
+
+
+def values_of(scenario: Scenario) -> dict[str, Any]:
+    """Where sliders and lists stand for a scenario; beyond its end a slider stands at it."""
+    gains, up, detector = scenario.controller, scenario.relay.uplink, scenario.error_detector
+    x_r, y_r, theta = detector.track_start
+    dx, dy = scenario.plant.initial_pose[0] - x_r, scenario.plant.initial_pose[1] - y_r
+    found: dict[str, Any] = {
+        "kx": gains.kx,
+        "ky": gains.ky,
+        "ktheta": gains.ktheta,
+        "ts": 1e3 * scenario.plant.ts,
+        "v_max": gains.v_max,
+        "ahead": dx * math.cos(theta) + dy * math.sin(theta),
+        "left": dy * math.cos(theta) - dx * math.sin(theta),
+        "p": up.p,
+        "r": up.r,
+        "n": up.n,
+        "seed": scenario.relay.seed,
+    }
+    for slider in SLIDERS:
+        found[slider.key] = round(min(slider.high, max(slider.low, found[slider.key])), 9)
+    return {**found, "model": up.model, "policy": detector.policy, "track": detector.track, "more": ""}
+
+
+def scenario_of(base: Scenario, values: Values) -> Scenario:
+    """The base scenario with what is set on the page. Raises ParameterError, whose text says what is allowed."""
+    return parse_scenario(base.to_yaml(), "the page", settings_of(base, values))
+
+
+def settings_of(base: Scenario, values: Values) -> list[str]:
+    """What is set on the page as settings `node.parameter=value`; what stands where the base has it is left out.
+
+    A slider shows less than a float holds: untouched, it must not change the base.
+    """
+    at_first = values_of(base)
+    moved = {key for key, value in values.items() if value != at_first[key]}
+    settings = [f"{_TARGETS[key]}={_text(key, values[key])}" for key in _TARGETS if key in moved]
+    if moved & {"ahead", "left"}:
+        settings.append(f"plant.initial_pose={list(_initial_pose(base, values['ahead'], values['left']))}")
+    return settings + [line.strip() for line in values["more"].splitlines() if line.strip()]
+
+
+_TARGETS = {
+    "kx": "controller.kx",
+    "ky": "controller.ky",
+    "ktheta": "controller.ktheta",
+    "ts": "plant.ts",
+    "v_max": "controller.v_max",
+    "p": "relay.uplink.p",
+    "r": "relay.uplink.r",
+    "n": "relay.uplink.n",
+    "seed": "relay.seed",
+    "model": "relay.uplink.model",
+    "policy": "error_detector.policy",
+    "track": "error_detector.track",
+}
+
+
+def _text(key: str, value: Any) -> str:
+    if key in CHOICES:
+        return str(value)
+    if key in ("n", "seed"):
+        return str(round(value))
+    if key == "v_max" and value >= NO_LIMIT:
+        return ".inf"
+    return repr(float(value) / 1e3 if key == "ts" else float(value))
+
+
+def _initial_pose(base: Scenario, ahead: float, left: float) -> tuple[float, float, float]:
+    x, y, theta = base.error_detector.track_start
+    cos, sin = math.cos(theta), math.sin(theta)
+    return x + ahead * cos - left * sin, y + ahead * sin + left * cos, base.plant.initial_pose[2]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A setting that tells something, and what."""
+
+    title: str
+    text: str
+    settings: tuple[str, ...]
+
+
+_STRAIGHT = ("error_detector.track=line", "relay.uplink.model=burst", "relay.uplink.n=16", "controller.kx=25.0")
+
+PRESETS = {
+    "paper": Preset(
+        "The paper's optimum",
+        "No outages, K_x = 25 1/s: the AGV closes the 5 m and stays on the oval.",
+        (
+            "error_detector.track=paper", "error_detector.policy=hold", "relay.uplink.model=perfect",
+            "controller.kx=25.0", "controller.ky=1.0", "controller.ktheta=2.0", "controller.v_max=.inf",
+            "plant.ts=0.005",
+        ),
+    ),
+    "missed": Preset(
+        "What the eigenvalues miss",
+        "A straight line, 16 poses lost after each received one: the paper's test holds for any number of outages "
+        "here, and the error grows.",
+        (*_STRAIGHT, "error_detector.policy=hold", "plant.ts=0.005"),
+    ),
+    "predicted": Preset(
+        "The predictor saves it",
+        "The same outages, but the edge moves the outdated pose on by the commands sent since.",
+        (*_STRAIGHT, "error_detector.policy=predict", "plant.ts=0.005"),
+    ),
+}  # fmt: skip
+
+
+def preset_values(base: Scenario, key: str) -> dict[str, Any]:
+    """Where sliders and lists stand for a preset."""
+    return values_of(parse_scenario(base.to_yaml(), "the page", PRESETS[key].settings))

@@ -1,0 +1,233 @@
+"""The explorer: its page moved in headless Chromium as a person would, its answers against simulation and theory."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from agv_analysis.explore.answer import answer, told, under_the_outages_of
+from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
+from agv_analysis.scenario import load_scenario, parse_scenario
+from agv_analysis.simulation.single import simulate
+from agv_ros.parameters import ParameterError
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+    from agv_analysis.scenario import Scenario
+    from test.conftest import Start
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def base() -> Scenario:
+    return load_scenario(str(REPOSITORY / "config/outages.yaml"))
+
+
+def test_a_page_that_nobody_has_touched_is_the_scenario_of_the_file(base: Scenario) -> None:
+    assert settings_of(base, values_of(base)) == []
+    assert scenario_of(base, values_of(base)) == base
+
+
+def test_what_a_slider_says_arrives_in_the_scenario(base: Scenario) -> None:
+    moved = {"kx": 40, "ts": 10, "v_max": 6, "ahead": 1.5, "left": -0.5, "n": 3, "seed": 9, "track": "eight"}
+    found = scenario_of(base, {**values_of(base), **moved, "more": " plant.duration=50\n\nplant.integration=arc"})
+    assert (found.controller.kx, found.plant.ts, found.controller.v_max) == (40.0, 0.01, 6.0)
+    # the track starts northwards: ahead is y, left is -x
+    np.testing.assert_allclose(found.plant.initial_pose[:2], (0.5, 1.5), atol=1e-12)
+    assert (found.relay.uplink.n, found.relay.seed, found.error_detector.track) == (3, 9, "eight")
+    assert (found.plant.duration, found.plant.integration) == (50.0, "arc")
+    again = {key: value for key, value in values_of(found).items() if key in moved}
+    assert again == pytest.approx({k: v for k, v in moved.items() if k != "track"} | {"track": "eight"})
+
+
+@pytest.mark.parametrize("more", ["controller.kx=-1.0", "plant.color=red", "relay.uplink.model=trace", "nonsense"])
+def test_what_is_not_allowed_is_refused_with_the_reason(base: Scenario, more: str) -> None:
+    with pytest.raises(ParameterError):
+        scenario_of(base, {**values_of(base), "more": more})
+
+
+def test_the_pinned_setting_meets_the_same_outages(base: Scenario) -> None:
+    pinned = scenario_of(base, {**values_of(base), "kx": 5, "model": "perfect", "seed": 3})
+    now = scenario_of(base, {**values_of(base), "kx": 40, "seed": 8})
+    runs = simulate(now), simulate(under_the_outages_of(pinned, now))
+    np.testing.assert_array_equal(runs[0].lost, runs[1].lost)
+    assert runs[0].lost.any()
+    assert runs[1].scenario.controller == pinned.controller
+    slower = scenario_of(base, {**values_of(base), "ts": 10})
+    assert simulate(under_the_outages_of(slower, now)).ts == 0.01
+
+
+def test_both_runs_are_drawn(base: Scenario) -> None:
+    found = answer(base, dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0)))
+    assert [trace["name"] for trace in found.track["data"]] == ["reference", "AGV", "pose lost", "pinned"]
+    assert [trace["name"] for trace in found.time["data"]].count("pinned") == 3
+    assert all(len(row) == 3 and row[2] for row in found.rows)
+    assert all(trace["type"] == "scatter" for trace in found.time["data"])
+
+
+def test_the_presets_tell_the_story(base: Scenario) -> None:
+    def late(key: str) -> tuple[float, str]:
+        run = simulate(scenario_of(base, preset_values(base, key)))
+        distance = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
+        return float(distance[-1]), dict(told(run))["Paper's test"]
+
+    assert list(PRESETS) == ["paper", "missed", "predicted"]
+    assert late("paper")[0] < 1e-6
+    error, paper = late("missed")
+    assert paper == "holds for any number of outages"
+    assert error > 1e3
+    assert late("predicted")[0] < 1e-6
+
+
+# -- in the browser ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def address(base: Scenario) -> Iterator[str]:
+    """The explorer, served by this process."""
+    import threading
+
+    from agv_analysis.explore.app import HOST, build
+
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    from werkzeug.serving import make_server
+
+    server = make_server(HOST, 0, build(base).server, threaded=True)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://{HOST}:{server.server_port}/"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+class Page:
+    """The page as a person has it before them."""
+
+    def __init__(self, chrome: Chrome) -> None:
+        self.chrome = chrome
+
+    def text(self, name: str) -> str:
+        return self.chrome.find_element("id", name).text
+
+    def until(self, condition: Callable[[], Any]) -> None:
+        from selenium.common.exceptions import StaleElementReferenceException
+        from selenium.webdriver.support.ui import WebDriverWait
+
+        ignored = [StaleElementReferenceException]
+        WebDriverWait(self.chrome, 60.0, 0.05, ignored_exceptions=ignored).until(lambda _: condition())
+
+    def click(self, name: str) -> None:
+        self.chrome.execute_script("arguments[0].click()", self.chrome.find_element("id", name))
+
+    def slider(self, name: str) -> Any:
+        return self.chrome.find_element("css selector", f"#{name} [role=slider]")
+
+    def names(self, plot: str) -> list[str]:
+        script = f"return document.querySelector('#plot-{plot} .js-plotly-plot').data.map(trace => trace.name)"
+        found: list[str] = self.chrome.execute_script(script)
+        return found
+
+
+@pytest.fixture
+def page(chromium: Chrome, address: str) -> Page:
+    chromium.get_log("browser")  # type: ignore[no-untyped-call]
+    chromium.get(address)
+    page = Page(chromium)
+    page.until(lambda: "Paper's test" in page.text("told"))
+    return page
+
+
+def complaints(page: Page) -> list[str]:
+    log = page.chrome.get_log("browser")  # type: ignore[no-untyped-call]
+    return [entry["message"] for entry in log if entry["level"] == "SEVERE"]
+
+
+def test_moving_a_slider_simulates_anew(page: Page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    assert "up to 14 along" in page.text("told")
+    handle = page.slider("kx")
+    handle.send_keys(Keys.PAGE_UP)  # ten steps at once
+    page.until(lambda: "up to 14 along" not in page.text("told"))
+    kx = float(handle.get_attribute("aria-valuenow"))
+    n = int(np.ceil(2.0 / (0.005 * kx)) - 2.0)  # T_s K_x L < 2 with L = n + 1
+    assert kx > 25.0
+    page.until(lambda: f"up to {n} along" in page.text("told"))
+    assert page.text("problem") == ""
+    assert complaints(page) == []
+
+
+def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
+    page.click("preset-missed")
+    page.until(lambda: "80 ms" in page.text("told"))
+    page.click("pin")
+    page.until(lambda: "pinned" in page.names("track"))
+    page.click("preset-predicted")
+    page.until(lambda: "predicted: with an exact model" in page.text("told"))
+    errors = page.text("told").splitlines()[0]
+    now, pinned = errors.removeprefix("Error in the last tenth at most ").split(" m at most ")
+    assert float(now) < 1e-6 < 1e3 < float(pinned.removesuffix(" m"))
+    assert page.names("time").count("pinned") == 3
+    page.click("unpin")
+    page.until(lambda: "pinned" not in page.names("time"))
+    assert complaints(page) == []
+
+
+def test_a_bad_setting_says_why_and_a_good_one_takes_it_back(page: Page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    more = page.chrome.find_element("id", "more")
+    more.send_keys("controller.kx=-3.0")
+    page.until(lambda: "controller.kx must be in [0, 1e+06], got -3.0" in page.text("problem"))
+    more.send_keys(Keys.CONTROL, "a")
+    more.send_keys("plant.duration=20.0")
+    page.until(lambda: page.text("problem") == "")
+    assert complaints(page) == []
+
+
+def test_what_is_exported_is_what_is_shown(page: Page, base: Scenario) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    page.slider("kx").send_keys(Keys.ARROW_RIGHT)
+    page.until(lambda: page.slider("kx").get_attribute("aria-valuenow") == "26")
+    page.click("export")
+    page.until(lambda: "explored.yaml" in page.text("exported"))
+    command, _, text = page.text("exported").partition("\n\n")
+    assert command == "agv-ncs simulate explored.yaml --report explored.html"
+    found = parse_scenario(text, "exported")
+    assert found == dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=26.0))
+
+
+# -- on the command line ----------------------------------------------------------------------------------------------
+
+
+def test_the_command_says_where_the_page_is_and_ends_on_ctrl_c(start: Start) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    served = start("agv_analysis.cli", "explore", "config/paper.yaml", "--port", "0", "--no-browser")
+    address = served.wait_for("explore:").split()[1]
+    assert address.startswith("http://127.0.0.1:")
+    served.process.send_signal(signal.SIGINT)
+    status, said = served.end()
+    assert (status, "Traceback" in said) == (0, False), said
+
+
+def test_a_port_that_is_taken_is_named(agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        status, said = agv_ncs("explore", "config/paper.yaml", "--port", str(port), "--no-browser")
+    assert status == 1
+    assert f"port {port} of 127.0.0.1 cannot be used" in said
+    assert "Traceback" not in said
