@@ -263,7 +263,7 @@ def test_the_command_writes_everything(made: Made) -> None:
     assert {claim["key"]: claim["verdict"] for claim in made.content["claims"]} == EXPECTED
     assert made.content["source"] == "simulation"
     for suffix in ("svg", "png", "csv"):
-        assert len(list(made.folder.glob(f"*.{suffix}"))) == 8
+        assert len(list(made.folder.glob(f"*.{suffix}"))) == 8 + 9
     assert (made.folder / "future.md").read_text().count("###") == len(made.content["future_work"]) == 9
 
 
@@ -356,3 +356,15 @@ def test_aligned_poses_have_no_bias(made: Made) -> None:
     by_policy = {row["policy"]: row["farthest from the reference [m]"] for row in rows if row["speed scale"] == 1.0}
     assert by_policy["align"] == 0.0
     assert by_policy["hold"] > 0.01
+
+
+def test_every_table_of_the_future_work_is_a_figure_with_its_data(made: Made) -> None:
+    for key, rows in made.content["future_work"].items():
+        root = ElementTree.parse(made.folder / f"{key}.svg").getroot()
+        assert root.get("width") == "252pt"
+        assert (made.folder / f"{key}.png").read_bytes().startswith(b"\x89PNG")
+        written = list(csv.DictReader((made.folder / f"{key}.csv").open()))
+        assert len(written) == len(rows)
+        for row, text in zip(rows, written, strict=True):
+            assert list(row) == list(text)
+            assert all(value is None or str(value) == text[name] for name, value in row.items())

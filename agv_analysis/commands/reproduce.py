@@ -27,7 +27,7 @@ def command(out: Path, ros: bool) -> None:
     """
     from rich.console import Console
 
-    from agv_analysis.reproduce import report
+    from agv_analysis.reproduce import dots, report
     from agv_analysis.reproduce.claim import check
     from agv_analysis.reproduce.claims import CLAIMS
     from agv_analysis.reproduce.figures import figures, write
@@ -46,6 +46,8 @@ def command(out: Path, ros: bool) -> None:
     report.print_claims(findings)
     with Console(stderr=True).status("simulating its future work ..."):
         found = list(tables())
+        for table in found:
+            dots.write(table, out)
     for table in found:
         report.print_table(table)
     report.write(findings, found, "recorded runs" if ros else "simulation", out)

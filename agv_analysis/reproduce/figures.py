@@ -24,7 +24,8 @@ WIDTH = 3.5
 SHOWN = 400
 """Steps of the error and the speed that are drawn: all that happens happens in the first 2 s."""
 
-_STYLE: Any = {"font.size": 8.0, "svg.fonttype": "path", "svg.hashsalt": "agv_ncs"}
+STYLE: Any = {"font.size": 8.0, "svg.fonttype": "path", "svg.hashsalt": "agv_ncs"}
+"""Of every figure: small letters, drawn as paths, and the same bytes for the same data."""
 
 _WIDTHS = (2.6, 1.7, 0.8)
 """Of the lines [pt]: where curves lie on one another the lower ones are seen."""
@@ -72,7 +73,7 @@ def write(figure: Figure, folder: Path) -> None:
     import matplotlib as mpl
     from matplotlib.figure import Figure as Canvas
 
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         canvas = Canvas(figsize=(WIDTH, WIDTH if figure.is_map else 0.65 * WIDTH), layout="constrained")
         axes = canvas.add_subplot()
         for width, (label, (x, y)) in zip(_WIDTHS, figure.curves.items(), strict=False):

@@ -23,29 +23,42 @@ from agv_analysis.simulation.batch import cores
 from agv_analysis.stability import bursts, lifted, mean_square, paper
 from agv_cloud.reference import Reference
 
+TO_1_CM = "to 1 cm [steps]"
+SHARE_OF_K_THETA = "K_y / K_theta^2"
+LARGEST = "largest error [m]"
+
 
 def tables() -> Iterator[Table]:
     """The future work, part by part."""
-    yield Table("gain_along", "Error along the track, 5 m: the fastest K_x beside the paper's", _gains_along())
-    across = [*_gains_across("1 m across", (1.0, 0.0, 0.0)), *_gains_across("0.5 rad", (0.0, 0.0, 0.5))]
-    yield Table("gains_across", "Errors across the track and of heading: the fastest K_y for each K_theta", across)
-    yield Table(
-        "loss_probability",
-        "Independent losses, from 5 m: median of the integral of |y_r - y_c| over a lap; share of twins that part",
-        _losses(),
-    )
-    yield Table("mean_burst", "20 % of the poses lost, by mean burst: the same", _mean_bursts())
-    yield Table("single_burst", "One burst, from step 1 on: steps from 5 m to 2 %, overshoot", _single_bursts())
-    yield Table("limit", "K_x = 25, n lost after each received pose: what a limit on |v| makes of it", _limits())
+    along = "Error along the track, 5 m: the fastest K_x beside the paper's"
+    yield Table("gain_along", along, _gains_along(), 2, [TO_1_CM])
+    rows = [*_gains_across("1 m across", (1.0, 0.0, 0.0)), *_gains_across("0.5 rad", (0.0, 0.0, 0.5))]
+    across = "Errors across the track and of heading: the fastest K_y for each K_theta"
+    yield Table("gains_across", across, rows, 2, [SHARE_OF_K_THETA])
+    losses = "Independent losses, from 5 m: median of the integral of |y_r - y_c| over a lap; share of twins that part"
+    yield Table("loss_probability", losses, _losses(), 2, _by_gain("[m s]"))
+    yield Table("mean_burst", "20 % of the poses lost, by mean burst: the same", _mean_bursts(), 2, _by_gain("[m s]"))
+    single = "One burst, from step 1 on: steps from 5 m to 2 %, overshoot"
+    yield Table("single_burst", single, _single_bursts(), 2, _by_gain("[steps]"))
+    limit = "K_x = 25, n lost after each received pose: what a limit on |v| makes of it"
+    yield Table("limit", limit, _limits(), 1, [f"{name}: {LARGEST}" for name in LIMITS])
     yield from policy_tables()
-    yield Table("criteria", "Largest n that is stable, by criterion and by twins driven for a lap", _criteria())
+    criteria = "Largest n that is stable, by criterion and by twins driven for a lap"
+    compared = ["constant n", "constant n, twins", "bursts", "bursts, twins"]
+    yield Table("criteria", criteria, _criteria(), 2, compared)
 
 
 def policy_tables() -> Iterator[Table]:
     """Policies for outages, ranked."""
     title = "K_x = 25 on the track, one lap: staleness policies on the same outages"
-    yield Table("staleness_policies", title, [*policies.edge()])
-    yield Table("downlink_policies", "The same for outages of the downlink", [*policies.downlink()])
+    yield Table("staleness_policies", title, [*policies.edge()], 3, [policies.ERROR])
+    title = "The same for outages of the downlink"
+    yield Table("downlink_policies", title, [*policies.downlink()], 2, [policies.ERROR])
+
+
+def _by_gain(quantity: str) -> list[str]:
+    """The columns of a quantity, one a gain."""
+    return [f"K_x = {kx:g} {quantity}" for kx in GAINS]
 
 
 # -- gains -------------------------------------------------------------------------------------------------------------
@@ -61,7 +74,7 @@ def _gains_along() -> list[Values]:
             rows.append({
                 "speed": name,
                 "K_x [1/s]": gains[index],
-                "to 1 cm [steps]": _reached(found["settle_1cm_steps"][index]),
+                TO_1_CM: _reached(found["settle_1cm_steps"][index]),
                 "overshoot": float(found["overshoot"][index]),
             })  # fmt: skip
     return rows
@@ -87,7 +100,7 @@ def _gains_across(name: str, offset: tuple[float, float, float]) -> list[Values]
             "error": name,
             "K_theta [1/m]": ktheta,
             "K_y [1/m^2]": best * ktheta**2,
-            "K_y / K_theta^2": best,
+            SHARE_OF_K_THETA: best,
             "to 1 cm, 0.01 rad [steps]": tried[best],
         })  # fmt: skip
     return rows
@@ -162,7 +175,7 @@ def _limits() -> list[Values]:
         for limit, v_max in LIMITS.items():
             wanted = scenario(*gain(25.0, v_max), ON_TRACK, "relay.uplink.model=burst", f"relay.uplink.n={n}")
             found = simulate_batch([wanted], [1], twins=True)[0, 0]
-            row[f"{limit}: largest error [m]"] = float(found["position_peak"])
+            row[f"{limit}: {LARGEST}"] = float(found["position_peak"])
             row[f"{limit}: twins"] = "come closer" if found["contraction"] < CLOSER else "part"
         rows.append(row)
     return rows

@@ -26,6 +26,10 @@ class Table:
     key: str
     title: str
     rows: Sequence[Values]
+    named: int
+    """So many columns, from the left, say what a row is about."""
+    drawn: Sequence[str]
+    """The columns that its figure shows."""
 
 
 def text_of(value: Any) -> str:

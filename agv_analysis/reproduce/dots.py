@@ -1,0 +1,68 @@
+"""The tables of the future work as figures: a line for each row, a dot for each value in it.
+
+As wide as a column of a paper, SVG and PNG, with the whole table as CSV beside them.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from agv_analysis.reproduce.claim import Values
+from agv_analysis.reproduce.figures import STYLE, WIDTH
+from agv_analysis.reproduce.report import Table, text_of
+from agv_ros.errors import UserError
+
+_WIDE = 100.0
+"""Ratio of the largest to the smallest positive value from which on the axis is logarithmic."""
+
+_MARKERS = "os^Dv*"
+
+
+def write(table: Table, folder: Path) -> None:
+    """Write a table to `folder` as SVG, PNG and CSV. Raises UserError if that cannot be written to."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure as Canvas
+
+    with mpl.rc_context(STYLE):
+        canvas = Canvas(figsize=(WIDTH, 0.8 + 0.15 * len(table.rows) + 0.15 * len(table.drawn)), layout="constrained")
+        _draw(canvas.add_subplot(), table)
+        canvas.legend(loc="outside upper left", frameon=False)
+        try:
+            canvas.savefig(folder / f"{table.key}.svg", metadata={"Date": None})
+            canvas.savefig(folder / f"{table.key}.png", dpi=300)
+            _write_csv(table.rows, folder / f"{table.key}.csv")
+        except OSError as error:
+            raise UserError(f"{folder / table.key}: cannot be written: {error.strerror}") from None
+
+
+def _draw(axes: Any, table: Table) -> None:
+    """`axes` is a matplotlib Axes. What did not happen, or is infinite, has no dot."""
+    shown: list[float] = []
+    for marker, column in zip(_MARKERS, table.drawn, strict=False):
+        dots = [(value, i) for i, row in enumerate(table.rows) if (value := _number(row[column])) is not None]
+        shown += [value for value, _ in dots]
+        axes.plot([x for x, _ in dots], [i for _, i in dots], marker, label=column, ms=4.0, alpha=0.8)
+    names = list(table.rows[0])[: table.named]
+    axes.set_yticks(range(len(table.rows)), [", ".join(text_of(row[name]) for name in names) for row in table.rows])
+    axes.set_ylabel(", ".join(names))
+    axes.invert_yaxis()
+    axes.grid(axis="y", lw=0.3)
+    sizes = [abs(value) for value in shown if value != 0.0]
+    if sizes and max(sizes) > _WIDE * min(sizes):
+        axes.set_xscale("symlog", linthresh=max(min(sizes), 1e-4 * min(max(sizes), 1.0)))
+
+
+def _number(value: object) -> float | None:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if is_number else None  # type: ignore[arg-type]
+
+
+def _write_csv(rows: Sequence[Values], path: Path) -> None:
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
