@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from agv_analysis.simulation import simulate
+from agv_cloud.staleness import POLICIES
+from agv_plant.downlink_policy import DOWNLINK_POLICIES
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
@@ -37,11 +40,54 @@ RUNS = {
 }  # fmt: skip
 
 
+CHANNELS = {
+    "perfect": (),
+    "bernoulli": ("relay.uplink.model=bernoulli", "relay.uplink.p=0.4"),
+    "gilbert_elliott": (*LOSSY, "relay.uplink.k=0.95"),
+    "burst": ("relay.uplink.model=burst", "relay.uplink.n=11"),
+    "trace": ("relay.uplink.model=trace",),
+}
+TRACKS = ("paper", "line", "circle", "eight", "warehouse", "csv")
+LIMITED = {"limited": "controller.v_max=2.0", "unlimited": "controller.v_max=.inf"}
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[str, str]:
+    """Settings that name a track's and a trace's file."""
+    track, trace = tmp_path / "track.csv", tmp_path / "trace.csv"
+    track.write_text("t,v,w\n0.0,1.0,0.5\n1.0,2.0,-0.5\n100.0,1.0,0.0\n")
+    trace.write_text("lost\n" + "0\n1\n1\n0\n1\n" * 5)
+    return f"error_detector.track_file={track}", f"relay.uplink.trace_file={trace}"
+
+
+@pytest.mark.parametrize("limit", LIMITED.values(), ids=LIMITED)
+@pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_channel_policy_and_limit(
+    drive: Callable[..., Run], files: tuple[str, str], policy: str, channel: tuple[str, ...], limit: str
+) -> None:
+    """Each with a track and a downlink policy of its own turn, so that all of them meet every other kind."""
+    turn = list(CHANNELS.values()).index(channel) + POLICIES.index(policy)
+    downlink = DOWNLINK_POLICIES[turn % len(DOWNLINK_POLICIES)]
+    settings = (*files, f"error_detector.track={TRACKS[turn % len(TRACKS)]}", f"plant.downlink_policy={downlink}")
+    lossy = ("relay.downlink.model=bernoulli", "relay.downlink.p=0.2", "plant.initial_pose=[0.3, -0.2, 1.3]")
+    agree(drive(*settings, *lossy, *channel, limit, f"error_detector.policy={policy}", "plant.duration=1.5"))
+
+
+@pytest.mark.parametrize("track", TRACKS)
+def test_every_track(drive: Callable[..., Run], files: tuple[str, str], track: str) -> None:
+    agree(drive(*files, *LOSSY, f"error_detector.track={track}", "plant.duration=1.5"))
+
+
 @pytest.mark.parametrize("settings", RUNS.values(), ids=RUNS)
 def test_a_recorded_run_is_the_simulated_one(drive: Callable[..., Run], settings: tuple[str, ...]) -> None:
-    recorded = drive(*settings, "plant.duration=3.0")
+    agree(drive(*settings, "plant.duration=3.0"))
+
+
+def agree(recorded: Run) -> None:
+    """Is the simulation of a recorded run's scenario that run, step by step?"""
     simulated = simulate(recorded.scenario)
-    assert len(recorded) == len(simulated) == 600
+    assert len(recorded) == len(simulated) == round(recorded.scenario.plant.duration / recorded.ts)
     for verdict in ("lost", "downlink_lost", "n_ul"):
         assert np.array_equal(getattr(recorded, verdict), getattr(simulated, verdict)), verdict
     np.testing.assert_allclose(recorded.pose, simulated.pose, rtol=0.0, atol=1e-9)

@@ -41,6 +41,8 @@ def write(table: Table, folder: Path) -> None:
 
 def _draw(axes: Any, table: Table) -> None:
     """`axes` is a matplotlib Axes. What did not happen, or is infinite, has no dot."""
+    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
+
     shown: list[float] = []
     for marker, column in zip(_MARKERS, table.drawn, strict=False):
         dots = [(value, i) for i, row in enumerate(table.rows) if (value := _number(row[column])) is not None]
@@ -53,7 +55,13 @@ def _draw(axes: Any, table: Table) -> None:
     axes.grid(axis="y", lw=0.3)
     sizes = [abs(value) for value in shown if value != 0.0]
     if sizes and max(sizes) > _WIDE * min(sizes):
-        axes.set_xscale("symlog", linthresh=max(min(sizes), 1e-4 * min(max(sizes), 1.0)))
+        smallest = max(min(sizes), 1e-4 * min(max(sizes), 1.0))
+        axes.set_xscale("symlog", linthresh=smallest)
+        locator = SymmetricalLogLocator(base=10.0, linthresh=smallest)
+        locator.set_params(numticks=4)
+        axes.xaxis.set_major_locator(locator)
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_xlim(left=0.0 if min(shown) >= 0.0 else None)
 
 
 def _number(value: object) -> float | None:
