@@ -11,7 +11,10 @@ from typing import Any
 
 import click
 
-COMMANDS = ("run", "analyse", "stability", "parameters", "simulate", "explore", "sweep", "bag", "replay", "reproduce")
+COMMANDS = (
+    "run", "analyse", "stability", "channel", "parameters", "simulate", "explore", "sweep", "bag", "replay",
+    "reproduce",
+)  # fmt: skip
 
 
 class _Group(click.Group):

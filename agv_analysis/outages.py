@@ -94,12 +94,13 @@ def outages(run: Run) -> Outages:
     if not len(run):
         raise UserError(f"{run.source}: no step of the loop in it, so no outage: record at least one")
     return Outages(
-        uplink=_link(run.k, run.lost, run.n_ul, run.ts),
-        downlink=_link(run.k, run.downlink_lost, ages(run.k, run.downlink_lost), run.ts),
+        uplink=link_outages(run.k, run.lost, run.n_ul, run.ts),
+        downlink=link_outages(run.k, run.downlink_lost, ages(run.k, run.downlink_lost), run.ts),
     )
 
 
-def _link(k: Steps, lost: Verdicts, age: Steps, ts: float) -> LinkOutages:
+def link_outages(k: Steps, lost: Verdicts, age: Steps, ts: float) -> LinkOutages:
+    """Outages of one link from its slots `k`, their verdicts and the age after each, shape (N,), N >= 1."""
     lengths = outage_lengths(k, lost)
     values, counts = np.unique(lengths, return_counts=True)
     return LinkOutages(

@@ -1,0 +1,126 @@
+"""`agv-ncs channel`: what a channel does, before anyone drives through it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from agv_analysis.commands import with_settings, write_json
+
+if TYPE_CHECKING:
+    from agv_analysis.channel_study import ChannelStudy
+
+
+@click.command("channel")
+@with_settings
+@click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose channel.")
+@click.option(
+    "--slots", type=click.IntRange(1, 10_000_000), default=100_000, show_default=True, help="How many slots to look at."
+)
+@click.option("--fit", metavar="TRACE", help="Look at the model that fits this trace, instead of the file's channel.")
+@click.option("--from-netem", metavar="LINE", help='Look at netem\'s channel, as in "loss gemodel 2% 20% 100% 0%".')
+@click.option("--netem", is_flag=True, help="Print the channel as an option of `tc qdisc ... netem`, and nothing else.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the distribution of n_ul to this file.")
+@click.option("--picture", type=click.Path(path_type=Path), help="Draw the channel to this file.")
+def command(
+    params: str,
+    settings: tuple[str, ...],
+    link: str,
+    slots: int,
+    fit: str | None,
+    from_netem: str | None,
+    netem: bool,
+    json_file: Path | None,
+    csv_file: Path | None,
+    picture: Path | None,
+) -> None:
+    """Say what a channel of the params file PARAMS does to its messages, beside what theory expects.
+
+    The slots are those that a run with the file's seed meets.
+
+    \b
+    Examples:
+      agv-ncs channel config/outages.yaml --picture channel.png
+      agv-ncs channel config/outages.yaml --set relay.uplink.r=0.05 --netem
+      agv-ncs channel config/outages.yaml --fit outages.csv
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from agv_analysis.channel_netem import from_netem as channel_of
+    from agv_analysis.channel_netem import to_netem
+    from agv_analysis.channel_study import draw, fitted, study, write_csv
+    from agv_analysis.scenario import load_scenario
+    from agv_plant.channels.trace import load_trace
+    from agv_ros.errors import UserError
+
+    relay = load_scenario(params, settings).relay
+    channel = relay.downlink if link == "downlink" else relay.uplink
+    if fit is not None and from_netem is not None:
+        raise UserError("--fit and --from-netem both name a channel: give one of them")
+    if fit is not None:
+        import numpy as np
+
+        channel = fitted(np.array(load_trace(fit)), channel)
+    if from_netem is not None:
+        channel = channel_of(from_netem, channel)
+    if netem:
+        click.echo(to_netem(channel))
+        return
+    found = study(channel, relay.seed, link, slots, relay.ts)
+    table = Table(box=None, pad_edge=False)
+    for column in ("", "these slots", "closed form"):
+        table.add_column(column, style=None if column else "bold")
+    for row in rows(found):
+        table.add_row(*row)
+    console = Console(highlight=False)
+    console.print(
+        f"[bold]{link}[/]: {setting(found)}, {slots} slots of {1e3 * relay.ts:g} ms, seed {relay.seed}", soft_wrap=True
+    )
+    console.print(table)
+    if csv_file is not None:
+        write_csv(csv_file, found)
+        click.echo(f"csv:     {csv_file}")
+    if picture is not None:
+        draw(picture, found)
+        click.echo(f"picture: {picture}")
+    if json_file is not None:
+        write_json(json_file, found.to_json())
+
+
+_SHOWN = {
+    "bernoulli": ("p",), "gilbert_elliott": ("p", "r", "h", "k"), "burst": ("n", "start_step"),
+    "trace": ("trace_file", "trace_end"),
+}  # fmt: skip
+"""The parameters that say what a model does."""
+
+_AGES = (1, 2, 5, 10, 20, 50, 100)
+"""The ages whose probability is printed; --csv writes all."""
+
+
+def setting(found: ChannelStudy) -> str:
+    """Model and parameters as text, as in `bernoulli, p 0.3`."""
+    shown = _SHOWN.get(found.channel.model, ())
+    return ", ".join([found.channel.model, *(f"{name} {getattr(found.channel, name)}" for name in shown)])
+
+
+def rows(found: ChannelStudy) -> Iterator[tuple[str, str, str]]:
+    """Name, what the slots give and what theory expects, as text; the last is a dash where nothing is known."""
+    outages, chain = found.outages, found.chain
+
+    def pair(name: str, measured: float, expected: float | None, unit: str) -> tuple[str, str, str]:
+        return name, f"{measured:.5g}{unit}", "-" if expected is None else f"{expected:.5g}{unit}"
+
+    yield pair("Loss rate", outages.loss_rate, None if chain is None else chain.loss_rate, "")
+    yield pair("Mean outage", outages.mean_burst, None if chain is None else chain.mean_burst, " slots")
+    yield "Longest outage", f"{outages.longest} slots", "-"
+    yield pair("Mean n_ul", outages.age.mean, None if chain is None else chain.mean_age, " slots")
+    measured, expected = found.age_shares, found.expected_age_shares
+    for n in _AGES:
+        if n < len(measured):
+            share = None if expected is None else 1.0 - float(expected[:n].sum())
+            yield pair(f"P(n_ul >= {n})", float(measured[n:].sum()), share, "")

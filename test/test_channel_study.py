@@ -1,0 +1,154 @@
+"""What `agv-ncs channel` says of a channel, and netem's figures in and out."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from agv_analysis.channel_netem import NetemError, from_netem, to_netem
+from agv_analysis.channel_study import age_distribution, fitted, study
+from agv_analysis.stability.chain import bernoulli, gilbert_elliott
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio import losses
+
+AgvNcs = Callable[..., tuple[int, str]]
+
+# -- the age's distribution ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("p", [0.0, 0.3, 0.9])
+def test_the_age_under_independent_losses_is_geometric(p: float) -> None:
+    assert age_distribution(bernoulli(p), 50) == pytest.approx([(1.0 - p) * p**j for j in range(50)], abs=1e-15)
+
+
+def test_the_age_under_bursts_begins_with_one_and_stays_with_one_less_r() -> None:
+    p, r = 0.02, 0.2
+    rate = p / (p + r)
+    expected = [1.0 - rate] + [rate * r * (1.0 - r) ** (j - 1) for j in range(1, 60)]
+    assert age_distribution(gilbert_elliott(p, r), 60) == pytest.approx(expected, abs=1e-15)
+
+
+@pytest.mark.parametrize("chain", [bernoulli(0.4), gilbert_elliott(0.1, 0.3, 0.2, 0.95)])
+def test_the_ages_have_the_mean_of_the_chain(chain: object) -> None:
+    shares = age_distribution(chain, 2000)  # type: ignore[arg-type]
+    assert shares.sum() == pytest.approx(1.0, abs=1e-12)
+    assert shares @ np.arange(2000) == pytest.approx(chain.mean_age, rel=1e-12)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    "channel",
+    [ChannelParameters(model="bernoulli", p=0.3), ChannelParameters(model="gilbert_elliott", p=0.05, r=0.2, h=0.1)],
+)
+def test_the_slots_of_a_channel_follow_its_closed_form(channel: ChannelParameters) -> None:
+    found = study(channel, 5, "uplink", 200_000, 0.005)
+    assert found.chain is not None
+    assert found.expected_age_shares is not None
+    # Five standard deviations; ages are correlated over some tens of slots at the most.
+    bound = 5.0 * math.sqrt(0.25 / 200_000 * 20.0)
+    assert abs(found.outages.loss_rate - found.chain.loss_rate) < bound
+    assert np.abs(found.age_shares - found.expected_age_shares).max() < bound
+    assert (found.lost == losses(channel, 5, "uplink", 200_000)).all()
+
+
+def test_a_channel_with_parameters_has_them_fitted() -> None:
+    channel = ChannelParameters(model="gilbert_elliott", p=0.05, r=0.2)
+    found = fitted(losses(channel, 1, "uplink", 200_000), ChannelParameters())
+    assert found.model == "gilbert_elliott"
+    assert (found.p, found.r) == pytest.approx((0.05, 0.2), rel=0.05)
+    independent = fitted(losses(ChannelParameters(model="bernoulli", p=0.3), 1, "uplink", 50_000), channel)
+    assert independent.model == "bernoulli"
+    assert independent.p == pytest.approx(0.3, rel=0.05)
+
+
+# -- netem -----------------------------------------------------------------------------------------------------------
+
+percents = st.integers(0, 10_000_000).map(lambda parts: f"{parts / 100_000:.5f}".rstrip("0").rstrip("."))
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.tuples(percents, percents, percents, percents))
+def test_netems_figures_go_in_and_out_unchanged(figures: tuple[str, ...]) -> None:
+    line = "loss gemodel " + " ".join(f"{figure}%" for figure in figures)
+    assert to_netem(from_netem(line, ChannelParameters())) == line
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.tuples(*[st.floats(0.0, 1.0)] * 2), st.sampled_from([0.0, 0.1, 0.37, 1.0]))
+def test_a_channel_goes_through_netem_unchanged(pr: tuple[float, float], h: float) -> None:
+    channel = ChannelParameters(model="gilbert_elliott", p=pr[0], r=pr[1], h=h, k=1.0)
+    assert from_netem(to_netem(channel), ChannelParameters()) == channel
+    independent = ChannelParameters(model="bernoulli", p=pr[0])
+    assert from_netem(to_netem(independent), ChannelParameters()) == independent
+
+
+def test_what_a_line_leaves_out_is_as_in_netem() -> None:
+    def parameters(line: str) -> tuple[float, ...]:
+        channel = from_netem(line, ChannelParameters())
+        return channel.p, channel.r, channel.h, channel.k
+
+    assert parameters("loss gemodel 2%") == (0.02, 0.98, 0.0, 1.0)
+    assert parameters("loss gemodel 2% 20%") == (0.02, 0.2, 0.0, 1.0)
+    assert parameters("loss gemodel 2 20 70") == (0.02, 0.2, 0.3, 1.0)
+    assert parameters("loss gemodel 1% 10% 70% 0.1%") == (0.01, 0.1, 0.3, 0.999)
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("loss gemodel 1% x", "'x'"),
+        ("loss gemodel 101%", "'101%'"),
+        ("loss gemodel nan", "'nan'"),
+        ("loss gemodel", "'loss gemodel'"),
+        ("loss state 1%", "'loss state 1%'"),
+        ("delay 10ms", "'10ms'|'delay 10ms'"),
+        ("", "''"),
+    ],
+)
+def test_a_line_that_netem_would_not_take_is_refused(line: str, found: str) -> None:
+    with pytest.raises(NetemError, match=f"must be loss gemodel .*; got ({found})"):
+        from_netem(line, ChannelParameters())
+
+
+def test_a_model_that_netem_does_not_have_is_refused() -> None:
+    with pytest.raises(NetemError, match="netem has no channel burst, only bernoulli and gilbert_elliott"):
+        to_netem(ChannelParameters(model="burst", n=3))
+
+
+# -- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_channel_prints_writes_and_draws(agv_ncs: AgvNcs, tmp_path: Path) -> None:
+    files = {name: tmp_path / f"channel.{name}" for name in ("json", "csv", "png")}
+    code, said = agv_ncs(
+        "channel", "config/outages.yaml", "--slots", "20000", "--json", str(files["json"]), "--csv", str(files["csv"]),
+        "--picture", str(files["png"]),
+    )  # fmt: skip
+    assert code == 0, said
+    assert "uplink: gilbert_elliott, p 0.02, r 0.2" in said
+    assert "closed form" in said
+    figures = json.loads(files["json"].read_text())
+    assert figures["closed_form"]["loss_rate"] == pytest.approx(0.02 / 0.22)
+    assert sum(figures["age_shares"]) == pytest.approx(1.0)
+    assert len(files["csv"].read_text().splitlines()) == 1 + len(figures["age_shares"])
+    assert files["png"].read_bytes().startswith(b"\x89PNG")
+
+
+def test_channel_fits_a_trace_and_speaks_netem(agv_ncs: AgvNcs, tmp_path: Path) -> None:
+    trace = tmp_path / "outages.csv"
+    lost = losses(ChannelParameters(model="gilbert_elliott", p=0.02, r=0.2), 1, "uplink", 20_000)
+    trace.write_text("lost\n" + "".join(f"{value:d}\n" for value in lost.tolist()))
+    code, said = agv_ncs("channel", "config/outages.yaml", "--fit", str(trace))
+    assert code == 0, said
+    assert "gilbert_elliott, p 0.02" in said
+    line = "loss gemodel 1% 10% 70% 0.1%"
+    assert agv_ncs("channel", "config/outages.yaml", "--from-netem", line, "--netem") == (0, line)
+    code, said = agv_ncs("channel", "config/outages.yaml", "--link", "downlink", "--netem")
+    assert code == 1
+    assert "netem has no channel perfect" in said
