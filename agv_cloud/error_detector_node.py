@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import TimeReference
 
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
+from agv_cloud.reference_path import path_points
 from agv_cloud.staleness import Posture, Prediction
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.unicycle import STEPS
@@ -20,6 +23,7 @@ from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
 from agv_ros.stamps import Steps
 from agv_ros.wire import (
+    FRAME_MAP,
     InvalidMessageError,
     Pose,
     TrackingError,
@@ -47,8 +51,23 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._error_out = self.output(Odometry, "edge/error")
         self.input(PoseStamped, "edge/pose", self._on_pose, self._error_out)
         self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
+        self._publish_path()
         if self._predicts:
             self.input(TwistStamped, "edge/cmd_vel", self._on_command)
+
+    def _publish_path(self) -> None:
+        """The reference for those who look on, once and latched; no part of the loop, so nobody is waited for."""
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._path_out = self.create_publisher(Path, "edge/reference", latched)
+        path = Path()
+        path.header.frame_id = FRAME_MAP
+        for point in path_points(self.reference, self.settings):
+            pose = PoseStamped()
+            pose.header.frame_id = FRAME_MAP
+            pose.pose.position.x, pose.pose.position.y = point.x, point.y
+            pose.pose.orientation.z, pose.pose.orientation.w = math.sin(0.5 * point.theta), math.cos(0.5 * point.theta)
+            path.poses.append(pose)
+        self._path_out.publish(path)
 
     def _new_prediction(self) -> Prediction:
         return Prediction(STEPS[self.settings.integration], self.settings.ts)

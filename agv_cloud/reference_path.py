@@ -1,0 +1,21 @@
+"""The reference as a path to look at: one lap, thinned, as a latched message for RViz and its like."""
+
+from __future__ import annotations
+
+from agv_cloud.parameters import ErrorDetectorParameters
+from agv_cloud.reference import Reference, ReferencePoint, lap_steps
+
+LONGEST = 50_000
+"""Steps that are looked at, at most: a node should not take long to come up."""
+
+MOST_POINTS = 500
+
+
+def path_points(reference: Reference, parameters: ErrorDetectorParameters) -> list[ReferencePoint]:
+    """One lap of the reference, evenly thinned to 500 points, with its first and its last step.
+
+    Of a lap of more than 50 000 steps, and of a track from a file beyond `lap_time`, only the beginning.
+    """
+    last = min(lap_steps(parameters), LONGEST)
+    stride = -(-last // (MOST_POINTS - 1))
+    return [reference[k] for k in (*range(0, last, stride), last)]
