@@ -38,14 +38,14 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     Raises UserError if the bag cannot be read, holds no loop, or nobody says what its parameters were.
     """
     bag = read_bag(path, topics=())
-    names = _loop_topics(bag, path, namespace)
+    names = loop_topics(bag, path, namespace)
     scenario = _scenario(bag, path, config)
     bag = read_bag(path, topics=tuple(names.values()))
     return _run(bag, names, scenario, str(path))
 
 
-def _loop_topics(bag: Bag, path: Path, namespace: str | None) -> dict[str, str]:
-    """The bag's name of each of the loop's topics."""
+def loop_topics(bag: Bag, path: Path, namespace: str | None) -> dict[str, str]:
+    """The bag's name of each of the loop's topics. Raises UserError if it holds no loop, or nobody says which."""
     found = sorted({name.removesuffix("agv/pose") for name in bag.topics if name.endswith("/agv/pose")})
     if namespace is not None:
         found = [prefix for prefix in found if prefix.strip("/") == namespace.strip("/")]

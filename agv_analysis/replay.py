@@ -9,15 +9,17 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.bags import read_bag
 from agv_analysis.convergence import wrapped
+from agv_analysis.recording import loop_topics
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, parse_scenario
 from agv_analysis.simulation.loop import answer, at_rest, received
@@ -26,6 +28,8 @@ from agv_cloud.reference import Reference
 from agv_cloud.staleness import Posture, Prediction
 from agv_plant.unicycle import STEPS
 from agv_ros.errors import UserError
+from agv_ros.stamps import Grid, OffGridError
+from agv_ros.wire import Command, InvalidMessageError, TrackingError, decode_slot, stamp_of
 
 TOLERANCE = 1e-9
 """Largest difference that is none, as a share of the recorded value where that is above 1."""
@@ -83,7 +87,14 @@ def compare(run: Run, scenario: Scenario) -> Comparison:
 
     Raises UserError if no step of the recording has both.
     """
-    error, command = _answers(run, scenario)
+    return compare_answers(run, *_answers(run, scenario))
+
+
+def compare_answers(run: Run, error: Floats, command: Floats) -> Comparison:
+    """Errors, shape (N, 3), and commands, shape (N, 2), of the run's steps against those that are recorded.
+
+    NaN is an answer that did not come. Raises UserError if no step of the recording can be compared.
+    """
     errors_apart = error - run.error
     errors_apart[:, 2] = wrapped(errors_apart[:, 2])
     return Comparison(
@@ -156,3 +167,99 @@ def _write(path: Path, lost: NDArray[np.bool_]) -> None:
         rows = csv.writer(file)
         rows.writerow(("k", "lost"))
         rows.writerows(enumerate(lost.astype(int).tolist()))
+
+
+def with_outages_of(run: Run, scenario: Scenario, folder: Path) -> Scenario:
+    """`scenario` in lockstep, for as long as the run and with the verdicts of both its links, in files in `folder`.
+
+    Raises UserError if the recording does not begin with step 0 or slots are missing.
+    """
+    if run.k[0] != 0:
+        raise UserError(f"{run.source}: begins with step {run.k[0]}, so its outages do not fit a run from step 0 on")
+    plant = dataclasses.replace(scenario.plant, duration=len(run) * run.ts, clock="lockstep")
+    uplink, downlink = (folder / f"{link}.csv" for link in ("uplink", "downlink"))
+    write_outages(uplink, run)
+    write_outages(downlink, run, downlink=True)
+    relay = dataclasses.replace(
+        scenario.relay,
+        uplink=dataclasses.replace(scenario.relay.uplink, model="trace", trace_file=str(uplink)),
+        downlink=dataclasses.replace(scenario.relay.downlink, model="trace", trace_file=str(downlink)),
+    )
+    return dataclasses.replace(scenario, plant=plant, relay=relay)
+
+
+# -- what came to the edge --------------------------------------------------------------------------------------------
+
+
+class Input(NamedTuple):
+    """What the edge got in one slot, as it came over the wire."""
+
+    k: int
+    stamp_ns: int
+    slot: bytes
+    pose: bytes | None
+    """The pose that the relay forwarded, None if it was lost."""
+    is_answered: bool
+    """Does an edge that knows this recording alone hold the pose that the slot names?"""
+
+
+class EdgeInputs(NamedTuple):
+    """All that came to the edge, by increasing step."""
+
+    namespace: str
+    slots: tuple[Input, ...]
+
+
+def read_inputs(path: Path, grid: Grid, namespace: str | None = None) -> EdgeInputs:
+    """Recorded slots and forwarded poses of one loop; of a step that is repeated, the first of each.
+
+    Raises UserError if the bag cannot be read or holds none.
+    """
+    bag = read_bag(path, topics=())
+    names = loop_topics(bag, path, namespace)
+    if "edge/pose" not in names:
+        raise UserError(f"{path}: has no topic edge/pose, so nobody knows what came to the edge: record it, too")
+    poses, slots = (_by_step(bag.payloads(names[topic]), grid) for topic in ("edge/pose", "edge/slot"))
+    if not slots:
+        raise UserError(f"{path}: no slot of {names['edge/slot']} is one of the parameters' sampling instants")
+    return EdgeInputs(names["edge/slot"].removesuffix("edge/slot").strip("/"), tuple(inputs_of(slots, poses, grid)))
+
+
+def _by_step(payloads: Iterable[bytes], grid: Grid) -> dict[int, bytes]:
+    found: dict[int, bytes] = {}
+    for data in payloads:
+        try:
+            found.setdefault(grid.step(stamp_of(data)), data)
+        except (InvalidMessageError, OffGridError):  # the reader of the run has said so
+            continue
+    return dict(sorted(found.items()))
+
+
+def inputs_of(slots: Mapping[int, bytes], poses: Mapping[int, bytes], grid: Grid) -> Iterator[Input]:
+    """What the edge gets in each slot, from slots and forwarded poses by increasing step; damaged slots are dropped."""
+    sent: set[int] = set()
+    for k, data in slots.items():
+        try:
+            slot = decode_slot(data)
+        except InvalidMessageError:
+            continue
+        if k in poses:
+            sent.add(grid.stamp(k))
+        yield Input(k, slot.stamp_ns, data, poses.get(k), slot.freshest_ns in sent)
+
+
+def on_steps(
+    run: Run, inputs: EdgeInputs, errors: Mapping[int, TrackingError], commands: Mapping[int, Command]
+) -> tuple[Run, Floats, Floats]:
+    """The run, without answers that could not be had again, and the edge's new answers for `compare_answers`."""
+    answerable = np.isin(run.k, [slot.k for slot in inputs.slots if slot.is_answered])[:, None]
+    error, command = np.full((len(run), 3), np.nan), np.full((len(run), 2), np.nan)
+    for row, k in enumerate(run.k.tolist()):
+        if k in errors:
+            error[row] = errors[k].x_e, errors[k].y_e, errors[k].theta_e
+        if k in commands:
+            command[row] = commands[k].v, commands[k].w
+    recorded = dataclasses.replace(
+        run, error=np.where(answerable, run.error, np.nan), command=np.where(answerable, run.command, np.nan)
+    )
+    return recorded, error, command

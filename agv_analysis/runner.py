@@ -14,16 +14,20 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
 import rclpy.logging
 from rclpy.executors import Executor
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from agv_analysis.parameters import RecorderParameters
 from agv_analysis.recorder_node import RecorderNode
+from agv_analysis.replay import EdgeInputs
+from agv_analysis.replay_node import Pace, ReplayNode
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
@@ -32,7 +36,8 @@ from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
 from agv_ros.executor import EXECUTORS, Stop, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
-from agv_ros.parameters import as_dict
+from agv_ros.parameters import LoopParameters, as_dict
+from agv_ros.wire import Command, TrackingError
 
 N = TypeVar("N", bound=LoopNode[Any])
 
@@ -94,32 +99,77 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
     connected = _connected(scenario, recorded=bag is not None)
-    with stop_on_signals() as stop, _params_file(scenario) as params, ExitStack() as stack:
-        context = rclpy.Context()
-        rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
-        stack.callback(context.try_shutdown)
-
-        def add(make: Callable[..., N], settings: object) -> N:
-            node = make(parameter_overrides=overrides(settings), context=context, use_global_arguments=False)
-            stack.callback(node.destroy_node)
-            return node
-
-        plant = add(PlantNode, connected.plant)
-        for told_by_outcome in ("plant", "recorder"):
-            rclpy.logging.set_logger_level(told_by_outcome, rclpy.logging.LoggingSeverity.WARN)
-        loop = [plant, *(add(NODES[name], getattr(connected, name)) for name in SCHEMAS if name != "plant")]
-        recorder = None if bag is None else add(RecorderNode, _recording(scenario, bag, params))
-        return _run_nodes(EXECUTORS[executor](context=context), plant, loop, recorder, stop, progress)
+    with stop_on_signals() as stop, _params_file(scenario) as params, OneProcess() as process:
+        plant = process.add(PlantNode, connected.plant)
+        rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # its Outcome says the same
+        loop = [plant, *(process.add(NODES[name], getattr(connected, name)) for name in SCHEMAS if name != "plant")]
+        recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params))
+        return run_nodes(EXECUTORS[executor](context=process.context), plant, loop, recorder, stop, progress)
 
 
-def _run_nodes(
+def replay_in_process(
+    scenario: Scenario, inputs: EdgeInputs, pace: Pace, bag: Path | None, progress: Progress, starts_edge: bool = True
+) -> tuple[Outcome, dict[int, TrackingError], dict[int, Command]]:
+    """Play recorded inputs to the edge's nodes, in this process or running elsewhere; also its answers by step.
+
+    Raises UserError if a parameter, the track's file or the bag's path cannot be used.
+    """
+    recorded, predicts = bag is not None, scenario.error_detector.policy == "predict"
+    listeners = {"error_detector": 2 + recorded, "controller": 1 + predicts + recorded}
+    with stop_on_signals() as stop, _params_file(scenario) as params, OneProcess(inputs.namespace) as process:
+        player = process.add(
+            partial(ReplayNode, inputs, pace),
+            LoopParameters(scenario.plant.ts, scenario.plant.start_time, 1 + recorded),
+        )
+        nodes: list[LoopNode[Any]] = [player]
+        for name, count in listeners.items() if starts_edge else ():
+            settings = dataclasses.replace(getattr(scenario, name), wait_for_subscribers=count)
+            nodes.append(process.add(NODES[name], settings, use_sim_time=True))
+        recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params))
+        outcome = run_nodes(EXECUTORS["events"](context=process.context), player, nodes, recorder, stop, progress)
+        return outcome, player.errors, player.commands
+
+
+class OneProcess:
+    """Nodes of this process, in a context of their own."""
+
+    def __init__(self, namespace: str = "") -> None:
+        self.context = rclpy.Context()
+        self._namespace = namespace
+        self._stack = ExitStack()
+
+    def __enter__(self) -> OneProcess:
+        rclpy.init(context=self.context, signal_handler_options=SignalHandlerOptions.NO)
+        self._stack.callback(self.context.try_shutdown)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def add(self, make: Callable[..., N], settings: object, use_sim_time: bool = False) -> N:
+        """Make a node with these settings."""
+        node = make(
+            parameter_overrides=[*overrides(settings), Parameter("use_sim_time", value=use_sim_time)],
+            context=self.context, use_global_arguments=False, namespace=self._namespace,
+        )  # fmt: skip
+        self._stack.callback(node.destroy_node)
+        return node
+
+    def add_recorder(self, settings: RecorderParameters) -> RecorderNode:
+        """Make a recorder, which says in the run's Outcome alone what it has recorded."""
+        rclpy.logging.set_logger_level("recorder", rclpy.logging.LoggingSeverity.WARN)
+        return self.add(RecorderNode, settings)
+
+
+def run_nodes(
     executor: Executor,
-    plant: PlantNode,
+    plant: PlantNode | ReplayNode,
     loop: Sequence[LoopNode[Any]],
     recorder: RecorderNode | None,
     stop: Stop,
     progress: Progress,
 ) -> Outcome:
+    """Run the nodes of a loop until the one that says when a step is over, plant or player, has done all steps."""
     for node in loop if recorder is None else (*loop, recorder):
         executor.add_node(node)
     pace = _Pace()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.channel_fit import Estimate
@@ -30,6 +30,25 @@ def print_table(analysis: Observations) -> None:
         )
     for note in analysis.run.notes:
         console.print(f"[dim]Note: {escape(note)}.[/]")
+
+
+def print_side_by_side(analyses: Mapping[str, Observations]) -> None:
+    """Print the figures of several runs, a column for each under its name, then what each must be told of."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    table = Table("", *analyses, box=None, pad_edge=False, header_style="bold")
+    found = [dict(rows(analysis)) for analysis in analyses.values()]
+    for name in dict.fromkeys(name for figures in found for name in figures):
+        table.add_row(f"[bold]{name}[/]", *(figures.get(name, "-") for figures in found))
+    console.print(table)
+    for title, analysis in analyses.items():
+        for topic, count in analysis.run.unexplained.items():
+            console.print(f"[bold red]{title} is invalid:[/] {count} messages of {escape(topic)} are missing.")
+        for sentence in (*analysis.disagreements(), *analysis.run.notes):
+            console.print(f"[dim]{title}: {escape(sentence)}.[/]")
 
 
 def rows(analysis: Observations) -> Iterator[tuple[str, str]]:

@@ -5,23 +5,36 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+import yaml
 
+from agv_analysis.bags import read_bag
 from agv_analysis.recording import read_run
-from agv_analysis.replay import compare, with_settings, write_outages
+from agv_analysis.replay import (
+    compare,
+    compare_answers,
+    inputs_of,
+    on_steps,
+    read_inputs,
+    with_outages_of,
+    with_settings,
+    write_outages,
+)
 from agv_analysis.run import Run
 from agv_analysis.scenario import SCHEMAS
 from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import load_trace
 from agv_ros.errors import UserError
+from agv_ros.wire import encode_clock
 
 if TYPE_CHECKING:
-    from test.conftest import Drive
+    from test.conftest import Drive, Start
 
 SAMPLE = Path(__file__).parents[1] / "bags/sample"
 AgvNcs = Callable[..., tuple[int, str]]
@@ -171,7 +184,7 @@ def test_the_command_says_whether_the_edge_changed(agv_ncs: AgvNcs, tmp_path: Pa
 
 
 def test_the_command_s_errors_are_one_line(agv_ncs: AgvNcs, tmp_path: Path) -> None:
-    for arguments in ((SAMPLE,), (SAMPLE, "--outages", tmp_path / "o.csv", "--set", "controller.kx=5.0")):
+    for arguments in ((SAMPLE, "--ros"), (SAMPLE, "--outages", tmp_path / "o.csv", "--set", "controller.kx=5.0")):
         assert agv_ncs("replay", *arguments)[0] == 2
     status, said = agv_ncs("replay", tmp_path / "none", "--compare")
     assert status == 1
@@ -185,3 +198,183 @@ def test_an_edge_with_a_staleness_policy_gives_the_same_answers_again(drive: Dri
     found = compare(run, run.scenario)
     assert found.error.first is None
     assert found.command.first is None
+
+
+# -- on DDS ------------------------------------------------------------------------------------------------------------
+
+
+def test_what_came_to_the_edge(sample: Run) -> None:
+    inputs = read_inputs(SAMPLE, sample.scenario.grid)
+    assert [slot.k for slot in inputs.slots] == sample.k.tolist()
+    assert [slot.pose is None for slot in inputs.slots] == sample.lost.tolist()
+    assert all(slot.is_answered for slot in inputs.slots)
+
+
+@pytest.mark.parametrize("pace", [["--lockstep"], ["--rate", "4"]])
+def test_the_edge_s_nodes_answer_as_they_did(agv_ncs: AgvNcs, pace: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    status, said = agv_ncs("replay", SAMPLE, *pace, "--compare", "--bag", tmp_path / "answers")
+    assert status == 0, said
+    assert "2000 slots played, 2000 errors and 2000 commands came back" in said
+    assert said.count("2000 steps compared, equal (largest difference 0.0e+00)") == 2
+    assert "everything that was published" in said
+    before, after = read_bag(SAMPLE), read_bag(tmp_path / "answers")
+    for topic in ("/edge/pose", "/edge/slot", "/edge/error", "/edge/cmd_vel"):
+        assert after.payloads(topic) == before.payloads(topic)
+
+
+def test_another_gain_in_the_nodes_is_another_gain_in_the_functions(
+    sample: Run, agv_ncs: AgvNcs, tmp_path: Path
+) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    change = ("--compare", "--set", "controller.kx=5.0", "--json")
+    assert agv_ncs("replay", SAMPLE, *change, tmp_path / "functions.json")[0] == 1
+    assert agv_ncs("replay", SAMPLE, "--lockstep", *change, tmp_path / "nodes.json")[0] == 1
+    functions, nodes = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("functions", "nodes"))
+    assert nodes["error"]["first"] is None
+    assert nodes["command"] == pytest.approx(functions["command"])
+
+
+@pytest.mark.parametrize("policy", ["align", "predict"])
+def test_policies_and_namespaces_on_dds(drive: Drive, policy: str, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    from agv_analysis.replay_node import Pace
+    from agv_analysis.runner import replay_in_process
+
+    run = drive(f"error_detector.policy={policy}", "plant.duration=2.0", config="outages")
+    inputs = read_inputs(Path(run.source), run.scenario.grid)._replace(namespace="robot7")
+    outcome, errors, commands = replay_in_process(run.scenario, inputs, Pace(lockstep=True), None, lambda _: None)
+    assert (outcome.failure, outcome.steps) == ("", 400)
+    assert not compare_answers(*on_steps(run, inputs, errors, commands)).differs
+
+
+def test_a_recording_that_begins_in_an_outage(sample: Run) -> None:
+    """Its first slots name a pose that is not in it: no answer can be had, none is waited for."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    from agv_analysis.replay_node import Pace
+    from agv_analysis.runner import replay_in_process
+
+    first = int(np.flatnonzero(sample.lost)[0])
+    whole = read_inputs(SAMPLE, sample.scenario.grid)
+    rest = whole.slots[first : first + 300]
+    slots = {slot.k: slot.slot for slot in rest}
+    poses = {slot.k: slot.pose for slot in rest if slot.pose is not None}
+    inputs = whole._replace(slots=tuple(inputs_of(slots, poses, sample.scenario.grid)))
+    outage = int(np.flatnonzero(~sample.lost[first:])[0])
+    assert [slot.is_answered for slot in inputs.slots] == [False] * outage + [True] * (300 - outage)
+    outcome, errors, commands = replay_in_process(sample.scenario, inputs, Pace(lockstep=True), None, lambda _: None)
+    assert outcome.failure == ""
+    comparison = compare_answers(*on_steps(sample, inputs, errors, commands))
+    assert not comparison.differs
+    assert comparison.error.compared == 300 - outage < 300
+
+
+def test_nodes_that_run_elsewhere_answer_too(agv_ncs: AgvNcs, start: Start) -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    params = Path(__file__).parents[1] / "config/outages.yaml"
+    for node in ("controller", "error_detector"):
+        start(
+            f"agv_cloud.{node}_node", "--ros-args", "--params-file", str(params), "-p", "use_sim_time:=true",
+            "-p", f"wait_for_subscribers:={1 + (node == 'error_detector')}",
+        )  # fmt: skip
+    status, said = agv_ncs("replay", SAMPLE, "--edge", "running", "--lockstep", "--compare")
+    assert status == 0, said
+    assert said.count("2000 steps compared, equal (largest difference 0.0e+00)") == 2
+
+
+def test_ros2_bag_play_into_nodes_on_simulated_time(start: Start) -> None:
+    """What `ros2 bag play --clock --topics /edge/pose /edge/slot` sends: the bytes at their times, QoS as recorded."""
+    rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    from geometry_msgs.msg import PoseStamped, TwistStamped
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import TimeReference
+
+    params = Path(__file__).parents[1] / "config/outages.yaml"
+    for name in ("controller", "error_detector"):
+        start(f"agv_cloud.{name}_node", "--ros-args", "--params-file", str(params), "-p", "use_sim_time:=true")
+    bag = read_bag(SAMPLE)
+    recorded = yaml.safe_load(bag.topics["/edge/slot"].offered_qos)[0]
+    qos = QoSProfile(depth=recorded["depth"] or 10, reliability=ReliabilityPolicy[recorded["reliability"].upper()])
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("rosbag2_player", context=context, use_global_arguments=False)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    answers: list[bytes] = []
+    node.create_subscription(TwistStamped, "edge/cmd_vel", answers.append, 1000, raw=True)
+    topics = {"/edge/pose": PoseStamped, "/edge/slot": TimeReference}
+    outputs = {topic: node.create_publisher(kind, topic, qos) for topic, kind in topics.items()}
+    clock = node.create_publisher(Clock, "/clock", 1)
+    messages = sorted(
+        (int(row["log_time_ns"]), topic, data)
+        for topic in topics
+        for row, data in zip(bag[topic], bag.payloads(topic), strict=True)
+    )
+    begun = messages[0][0]
+    ticks = [(ns, "/clock", encode_clock(ns)) for ns in range(begun, messages[-1][0], 25_000_000)]  # 40 Hz
+    outputs["/clock"] = clock
+    wanted = bag.payloads("/edge/cmd_vel")
+
+    def spin_until(done: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 60.0
+        while not done() and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.01)
+
+    try:
+        spin_until(
+            lambda: (
+                all(output.get_subscription_count() for output in outputs.values())
+                and node.count_publishers("/edge/cmd_vel") == 1
+                and node.count_subscribers("/edge/error") == 1
+            )
+        )
+        started = time.monotonic_ns()
+        for ns, topic, data in sorted([*messages, *ticks]):
+            while time.monotonic_ns() - started < ns - begun:
+                executor.spin_once(timeout_sec=0.001)
+            outputs[topic].publish(data)
+        spin_until(lambda: len(answers) >= len(wanted))
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+    assert answers == wanted
+
+
+# -- driven again ------------------------------------------------------------------------------------------------------
+
+
+def test_the_recorded_outages_and_gains_give_the_recorded_run(sample: Run, tmp_path: Path) -> None:
+    again = simulate(with_outages_of(sample, sample.scenario, tmp_path))
+    assert (again.lost == sample.lost).all()
+    assert np.abs(again.pose - sample.pose).max() < 1e-9
+
+
+@pytest.mark.parametrize("ros", [(), ("--ros",)])
+def test_two_runs_in_one_table(agv_ncs: AgvNcs, tmp_path: Path, ros: tuple[str, ...]) -> None:
+    if ros:
+        pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    status, said = agv_ncs(
+        "replay", SAMPLE, "--again", *ros, "--set", "controller.kx=5.0", "--json", tmp_path / "both.json"
+    )
+    assert status == 0, said
+    assert "recorded" in said
+    assert "again" in said
+    found = json.loads((tmp_path / "both.json").read_text())
+    for same in ("steps", "loss_rate", "outage_lengths", "n_ul_max"):
+        assert found["recorded"][same] == found["again"][same]
+    assert found["recorded"]["settle_2pct_steps"] != found["again"]["settle_2pct_steps"]
+
+
+def test_a_recording_without_its_beginning_is_not_driven_again(sample: Run, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="begins with step 3"):
+        with_outages_of(without(sample, 0, 1, 2), sample.scenario, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["--lockstep --rate 2", "--again --compare", "--ros", "--edge running --set controller.kx=5.0", "--rate 0"],
+)
+def test_options_that_exclude_each_other(agv_ncs: AgvNcs, arguments: str) -> None:
+    assert agv_ncs("replay", SAMPLE, *arguments.split())[0] == 2

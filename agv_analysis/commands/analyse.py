@@ -45,6 +45,8 @@ def command(
     from agv_analysis.table import print_table
 
     if any((pose_topic, command_topic, reference_topic, track_file, topics)):
+        if namespace is not None:
+            raise click.UsageError("--namespace chooses one of several loops; another robot's topics are named in full")
         names = read_topics(topics, pose_topic, command_topic, reference_topic)
         run = read_robot_run(bag, names, track_file, config)
     else:

@@ -2,49 +2,66 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from agv_analysis.commands import write_json
 
 if TYPE_CHECKING:
-    from agv_analysis.replay import Difference
+    from agv_analysis.replay import Comparison, Difference
+    from agv_analysis.run import Run
+    from agv_analysis.scenario import Scenario
+
+_NO_ROS = (
+    "this runs on ROS 2, which is not to be found here ({}): source your ROS 2 installation, or "
+    "`pip install 'agv_ncs[ros]'`; --compare and --again alone need none"
+)
 
 
 @click.command("replay")
 @click.argument("bag", type=click.Path(path_type=Path))
-@click.option("--compare", is_flag=True, help="Derive errors and commands anew; exit status 1 if they differ.")
+@click.option("--lockstep", is_flag=True, help="On DDS, each slot as soon as the one before is answered.")
+@click.option("--rate", type=click.FloatRange(min=0.0, min_open=True), help="On DDS, R times as fast as recorded.")
+@click.option("--edge", type=click.Choice(["own", "running"]), default="own", help="On DDS, whose nodes answer.")
+@click.option("--bag", "out", type=click.Path(path_type=Path), help="Record the replay to this directory.")
+@click.option("--compare", is_flag=True, help="Hold errors and commands against the recorded; exit status 1 if not.")
+@click.option("--again", is_flag=True, help="Drive again under the recorded outages; both runs in one table.")
+@click.option("--ros", is_flag=True, help="With --again: on DDS instead of simulated.")
 @click.option("--outages", type=click.Path(path_type=Path), help="Write the verdicts to this CSV file.")
 @click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose verdicts.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the comparison to this file, too.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the result to this file, too.")
 @click.option("--config", type=click.Path(path_type=Path), help="The params file to use instead of the bag's own.")
-@click.option(
-    "--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter for --compare."
-)
+@click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter.")
 @click.option("--namespace", help="Which loop, for a bag of several.")
 def command(
-    bag: Path, compare: bool, outages: Path | None, link: str, json_file: Path | None, config: Path | None,
-    settings: tuple[str, ...], namespace: str | None,
+    bag: Path, lockstep: bool, rate: float | None, edge: str, out: Path | None, compare: bool, again: bool, ros: bool,
+    outages: Path | None, link: str, json_file: Path | None, config: Path | None, settings: tuple[str, ...],
+    namespace: str | None,
 ) -> None:  # fmt: skip
-    """Play the recording BAG to the edge's functions again, or take its outages into another run.
+    """Play the recording BAG to the edge's nodes or functions again, or drive again under its outages.
 
     \b
     Examples:
-      agv-ncs replay bags/first --compare
+      agv-ncs replay bags/first
+      agv-ncs replay bags/first --lockstep --compare --bag bags/answers
       agv-ncs replay bags/first --compare --set controller.kx=5.0 --json changed.json
+      agv-ncs replay bags/first --again --set controller.kx=5.0
       agv-ncs replay bags/first --outages outages.csv
-      agv-ncs run config/paper.yaml --set relay.uplink.model=trace --set relay.uplink.trace_file=outages.csv --bag again
     """
     from agv_analysis.recording import read_run
     from agv_analysis.replay import compare as compare_run
     from agv_analysis.replay import with_settings, write_outages
 
-    if not compare and outages is None:
-        raise click.UsageError("nothing to do: ask for --compare or --outages FILE")
-    if not compare and (json_file is not None or settings):
-        raise click.UsageError("--json and --set belong to --compare")
+    on_dds = lockstep or rate is not None or edge == "running" or out is not None or not (compare or again or outages)
+    _check(lockstep and rate is not None, "--lockstep and --rate exclude each other")
+    _check(again and (on_dds or compare), "--again is a run of its own, without --compare, --rate, --lockstep, --bag")
+    _check(ros and not again, "--ros belongs to --again; --rate and --lockstep are on DDS anyway")
+    _check(json_file is not None and not (compare or again), "--json belongs to --compare or --again")
+    _check(bool(settings) and not (compare or again or on_dds), "--set belongs to a replay, --compare or --again")
+    _check(bool(settings) and edge == "running", "--set cannot change nodes that run already: use `ros2 param set`")
     run = read_run(bag, config, namespace)
     for note in run.notes:
         click.echo(note, err=True)
@@ -53,14 +70,87 @@ def command(
         click.echo(
             f"outages: {outages}: {lost} of {len(run)} slots lost, the first is step {run.k[0]} of the recording"
         )
-    if not compare:
-        return
-    comparison = compare_run(run, with_settings(run.scenario, settings))
+    scenario = with_settings(run.scenario, settings)
+    if again:
+        _drive_again(run, scenario, ros, json_file)
+    elif on_dds:
+        _play(run, scenario, namespace, lockstep, rate or 1.0, edge == "own", out, compare, json_file)
+    elif compare:
+        _say(compare_run(run, scenario), json_file)
+
+
+def _check(is_wrong: bool, text: str) -> None:
+    if is_wrong:
+        raise click.UsageError(text)
+
+
+def _runner() -> Any:
+    try:
+        from agv_analysis import runner
+    except ImportError as error:
+        raise click.ClickException(_NO_ROS.format(error)) from None
+    return runner
+
+
+def _play(
+    run: Run, scenario: Scenario, namespace: str | None, lockstep: bool, rate: float, starts_edge: bool,
+    out: Path | None, compare: bool, json_file: Path | None,
+) -> None:  # fmt: skip
+    runner = _runner()
+    from agv_analysis.progress import step_bar
+    from agv_analysis.replay import compare_answers, on_steps, read_inputs
+    from agv_analysis.replay_node import Pace
+
+    inputs = read_inputs(Path(run.source), scenario.grid, namespace)
+    with step_bar(len(inputs.slots), "playing") as progress:
+        outcome, errors, commands = runner.replay_in_process(
+            scenario, inputs, Pace(lockstep, rate), out, progress, starts_edge
+        )
+    click.echo(f"{outcome.steps} slots played, {len(errors)} errors and {len(commands)} commands came back")
+    if outcome.recording:
+        click.echo(f"bag: {out}: {outcome.recording}")
+    failures = [failure for failure in (outcome.failure, outcome.recording_failure) if failure]
+    if failures:
+        raise click.ClickException("; ".join(failures))
+    if compare:
+        _say(compare_answers(*on_steps(run, inputs, errors, commands)), json_file)
+
+
+def _say(comparison: Comparison, json_file: Path | None) -> None:
     click.echo(f"errors:   {_words(comparison.error)}\ncommands: {_words(comparison.command)}")
     if json_file is not None:
         write_json(json_file, comparison.to_json())
     if comparison.differs:
         raise click.exceptions.Exit(1)
+
+
+def _drive_again(run: Run, scenario: Scenario, ros: bool, json_file: Path | None) -> None:
+    from agv_analysis.analysis import analyse
+    from agv_analysis.replay import with_outages_of
+    from agv_analysis.simulation.single import simulate
+    from agv_analysis.table import print_side_by_side
+
+    with tempfile.TemporaryDirectory(prefix="agv_ncs_") as folder:
+        scenario = with_outages_of(run, scenario, Path(folder))
+        second = _on_dds(scenario, Path(folder) / "bag") if ros else simulate(scenario)
+        analyses = {"recorded": analyse(run), "again": analyse(second)}
+    print_side_by_side(analyses)
+    if json_file is not None:
+        write_json(json_file, {name: analysis.to_json() for name, analysis in analyses.items()})
+
+
+def _on_dds(scenario: Scenario, bag: Path) -> Run:
+    runner = _runner()
+    from agv_analysis.progress import step_bar
+    from agv_analysis.recording import read_run
+
+    with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
+        outcome = runner.run_in_process(scenario, bag, progress)
+    if outcome.recording_failure:
+        raise click.ClickException(outcome.recording_failure)
+    if outcome.failure:
+        click.echo(outcome.failure, err=True)
+    return read_run(bag)
 
 
 def _words(difference: Difference) -> str:
