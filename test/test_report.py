@@ -210,6 +210,27 @@ def test_the_commands_write_them(agv_ncs: Callable[..., tuple[int, str]], tmp_pa
     assert "Traceback" not in said
 
 
+@pytest.mark.parametrize(
+    ("axes", "kind"),
+    [(["controller.kx=25,500"], "scatter"), (["controller.kx=25,500", "relay.uplink.p=0.0,0.02"], "heatmap")],
+)
+def test_a_sweep_has_a_report(
+    chromium: Chrome, agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path, axes: list[str], kind: str
+) -> None:
+    varied = [word for axis in axes for word in ("--vary", axis)]
+    options = ("--set", "plant.duration=5.0", "--seeds", 3, "--report", tmp_path / "s.html", "--figures", tmp_path)
+    status, said = agv_ncs("sweep", "config/outages.yaml", *varied, *options)
+    assert status == 0, said
+    show(chromium, tmp_path / "s.html")
+    assert complaints(chromium) == []
+    points, half = 2 ** len(axes), 2 ** len(axes) // 2
+    verdict = chromium.find_element("id", "verdict").text
+    assert verdict == f"Of {points} points the loop is stable in every run at {half}, and in none at {half}."
+    assert of_plot(chromium, "instability", "plot._fullData[0].type") == kind
+    assert len(chromium.find_elements("css selector", "#points tr")) == points + 1
+    assert (tmp_path / "instability.svg").is_file()
+
+
 def test_a_folder_that_cannot_be_written_to_is_named(lap: Analysis, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="file: cannot be written to"):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import with_settings
+from agv_analysis.commands import with_report, with_settings
 from agv_analysis.sweep import METRICS
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ _LONGEST_TABLE = 40
 @click.option("--resume", is_flag=True, help="Go on with the sweep in --out, which was stopped.")
 @click.option("--workers", type=click.IntRange(1), help="Threads on this machine; one a core by default.")
 @click.option("--scheduler", metavar="ADDRESS", help="Run on the Dask cluster whose scheduler is there.")
+@with_report
 def command(
     params: str,
     settings: tuple[str, ...],
@@ -45,6 +46,8 @@ def command(
     resume: bool,
     workers: int | None,
     scheduler: str | None,
+    report: Path | None,
+    figures: Path | None,
 ) -> None:
     """Simulate the params file PARAMS at every point of a grid, under many seeds: how likely is the loop unstable?
 
@@ -78,6 +81,7 @@ def command(
     with step_bar(sweep.size * seeds, "simulating") as progress:
         rows, complete = collect(sweep, store, results, progress)
     _report(sweep, rows, metrics, out, suffix)
+    _pages(sweep, rows, report, figures)
     if not complete:
         again = ": the same command with --resume goes on" if out is not None else ""
         click.echo(
@@ -100,6 +104,22 @@ def _report(sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], 
         column = metric if metric == "instability" else f"{metric}_p50"
         draw(sweep, rows, column, out / f"{metric}.png")
         click.echo(f"picture: {out / f'{metric}.png'}")
+
+
+def _pages(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None, figures: Path | None) -> None:
+    """Write what `with_report` asks for."""
+    if report is not None:
+        from agv_analysis.report.sweep import write_sweep_report
+
+        axes = " ".join(f"--vary {axis.name}={','.join(map(str, axis.values))}" for axis in sweep.axes)
+        command = f"agv-ncs sweep params.yaml {axes} --seeds {len(sweep.seeds)} --report report.html"
+        write_sweep_report(sweep, rows, report, command)
+        click.echo(f"report:  {report}")
+    if figures is not None and rows:
+        from agv_analysis.report.sweep import draw_sweep_figures
+
+        draw_sweep_figures(sweep, rows, figures)
+        click.echo(f"figures: {figures}")
 
 
 def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:

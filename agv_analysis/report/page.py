@@ -53,24 +53,24 @@ def sentence(analysis: Observations) -> str:
 
 def write_report(analysis: Observations, path: Path) -> None:
     """Write the report of a run. Raises UserError if it cannot be written or if plotly or jinja2 is not installed."""
-    text = render(analysis)
+    write_page(render(analysis), path)
+
+
+def write_page(html: str, path: Path) -> None:
+    """Write a page. Raises UserError if that is not possible."""
     try:
-        path.write_text(text, encoding="utf-8", errors="backslashreplace")
+        path.write_text(html, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def render(analysis: Observations) -> str:
     """The report of a run as HTML. Raises UserError if plotly or jinja2 is not installed."""
-    try:
-        jinja2: Any = importlib.import_module("jinja2")
-        plotly: Any = importlib.import_module("plotly.offline")
-    except ImportError as error:
-        raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
-    source = Path(__file__).with_name("report.html.j2").read_text(encoding="utf-8")
-    template = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(source)
     drawn = list(panels(analysis))
-    text: str = template.render(
+    return fill(
+        "report.html.j2",
+        figures={key: figure(group) for key, _, group in _groups(drawn)},
+        data=report_json(analysis, drawn),
         title=f"agv_ncs: {analysis.run.source}",
         verdict=sentence(analysis),
         word=analysis.verdict.word if isinstance(analysis, Analysis) and not analysis.run.unexplained else "unknown",
@@ -80,12 +80,29 @@ def render(analysis: Observations) -> str:
         margins=list(_margins(analysis)),
         sections=list(_sections(drawn)),
         parameters=analysis.run.scenario.to_yaml(),
-        versions=_versions(),
         reproduce=_reproduce(analysis),
-        # Both are scripts, not text: the library, and JSON in which nothing can end a script.
+    )
+
+
+def fill(template: str, figures: dict[str, Any], data: dict[str, Any], **content: Any) -> str:
+    """A template of this folder, filled. Raises UserError if plotly or jinja2 is not installed.
+
+    `figures` go to plotly.js by the key of their place in the page, `data` is what the page offers to save.
+    """
+    try:
+        jinja2: Any = importlib.import_module("jinja2")
+        plotly: Any = importlib.import_module("plotly.offline")
+    except ImportError as error:
+        raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    # Library and figures are scripts, not text: what goes into one is JSON in which nothing can end it.
+    text: str = environment.get_template(template).render(
         library=plotly.get_plotlyjs(),
-        figures=_for_script({key: figure(group) for key, _, group in _groups(drawn)}),
-        data=_for_script(report_json(analysis, drawn)),
+        figures=_for_script(figures),
+        data=_for_script(data),
+        versions=versions(),
+        **content,
     )
     return text
 
@@ -95,7 +112,7 @@ def report_json(analysis: Observations, drawn: list[Panel]) -> dict[str, Any]:
     return {
         "sentence": sentence(analysis),
         "analysis": analysis.to_json(),
-        "versions": _versions(),
+        "versions": versions(),
         "parameters": analysis.run.scenario.to_yaml(),
         "panels": {panel.key: to_json(panel, _FEW) for panel in drawn},
     }
@@ -141,7 +158,8 @@ def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
         yield from rows(margins(analysis.run.scenario), analysis.run.ts)
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """What made the page."""
     return {"agv_ncs": version(), "Python": platform.python_version(), "numpy": np.__version__}
 
 

@@ -1,0 +1,95 @@
+"""The report of a sweep: how likely the loop is unstable, point by point."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.report.page import fill, versions, write_page
+from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel
+from agv_analysis.report.plotly import figure
+from agv_analysis.sweep.picture import can_draw, draw
+from agv_analysis.sweep.plan import Sweep
+from agv_ros.errors import UserError
+
+_MOST_ROWS = 500
+
+Rows = list[dict[str, Any]]
+
+
+def sweep_sentence(rows: Rows) -> str:
+    """What a sweep found, in one sentence."""
+    if not rows:
+        return "No point of the sweep was run."
+    calm = sum(row["unstable"] == 0 for row in rows)
+    bad = sum(row["unstable"] == row["runs"] for row in rows)
+    if calm == len(rows):
+        return f"The loop is stable in every run at all {len(rows)} points."
+    return f"Of {len(rows)} points the loop is stable in every run at {calm}, and in none at {bad}."
+
+
+def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> None:
+    """Write the report of a sweep; `command` makes it anew. Raises UserError as `write_report`."""
+    drawn = {"instability": sweep_figure(sweep, rows)} if rows and can_draw(sweep) else {}
+    plain = [{name: _plain(value) for name, value in row.items()} for row in rows]
+    parameters = sweep.base.to_yaml()
+    html = fill(
+        "sweep.html.j2",
+        figures=drawn,
+        data={"sentence": sweep_sentence(rows), "points": plain, "parameters": parameters, "versions": versions()},
+        title="agv_ncs: sweep",
+        verdict=sweep_sentence(rows),
+        word="unknown",
+        sections=[{"key": key, "title": "Probability of instability", "height": 520} for key in drawn],
+        columns=list(plain[0]) if plain else [],
+        rows=plain[:_MOST_ROWS],
+        left_out=max(0, len(plain) - _MOST_ROWS),
+        parameters=parameters,
+        reproduce=command,
+    )
+    write_page(html, path)
+
+
+def sweep_figure(sweep: Sweep, rows: Rows) -> dict[str, Any]:
+    """Probability of instability: with its confidence over one axis, as a heat map over two."""
+    if len(sweep.axes) == 1:
+        (axis,) = sweep.axes
+        rows = sorted(rows, key=lambda row: float(row[axis.name]))
+        x = np.array([row[axis.name] for row in rows], dtype=np.float64)
+        names = (("instability", DRIVEN), ("instability_low", LIMIT), ("instability_high", LIMIT))
+        lines = tuple(Line(name, x, np.array([row[name] for row in rows]), role) for name, role in names)
+        return figure([Panel("instability", "Instability", axis.label, "probability", lines, y_range=(-0.02, 1.02))])
+    across, up = sorted(sweep.axes, key=lambda axis: axis.name != "controller.kx")
+    x_values, y_values = sorted(across.values), sorted(up.values)
+    places = {(row[across.name], row[up.name]): row["instability"] for row in rows}
+    z = [[places.get((i, j)) for i in x_values] for j in y_values]
+    heat = {"type": "heatmap", "x": x_values, "y": y_values, "z": z, "zmin": 0.0, "zmax": 1.0}
+    layout = {
+        "xaxis": {"title": {"text": across.label}}, "yaxis": {"title": {"text": up.label}},
+        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
+        "margin": {"l": 60, "r": 12, "t": 8, "b": 44},
+    }  # fmt: skip
+    return {"data": [{**heat, "colorscale": "Viridis"}], "layout": layout}
+
+
+def draw_sweep_figures(sweep: Sweep, rows: Rows, folder: Path) -> None:
+    """Draw the probability of instability to `folder`, as SVG and PDF. Raises UserError if that is not possible."""
+    import matplotlib as mpl
+
+    from agv_analysis.report.figures import STYLE
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written to: {error.strerror}") from None
+    with mpl.rc_context(STYLE):
+        for suffix in ("svg", "pdf"):
+            draw(sweep, rows, "instability", folder / f"instability.{suffix}")
+
+
+def _plain(value: Any) -> Any:
+    """JSON has neither infinity nor NaN."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
