@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from agv_plant.channels import MODELS
+from agv_plant.channels.installed import TRACE, known_models
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.unicycle import STEPS
@@ -56,7 +56,7 @@ class PlantParameters(LoopParameters):
 class ChannelParameters:
     """One direction of the radio channel."""
 
-    model: str = parameter("perfect", "channel model", choices=(*MODELS, "trace"))
+    model: str = parameter("perfect", "channel model", choices=known_models())
     p: float = parameter(
         0.0, "bernoulli: loss probability; gilbert_elliott: probability of good to bad, per slot", low=0.0, high=1.0,
         runtime=True,
@@ -81,10 +81,13 @@ class ChannelParameters:
         "trace: what follows its last slot; repeat: the first, hold: no more losses, stop: an error",
         choices=ENDS,
     )
+    arguments: tuple[float, ...] = parameter(
+        (0.0,), "a model of another package: whatever numbers it takes", any_length=True, runtime=True
+    )
 
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
-        if self.model == "trace" and not self.trace_file:
+        if self.model == TRACE and not self.trace_file:
             raise ParameterError("a channel's model is trace, but its trace_file is empty: name a file")
 
 

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_plant.channels import GOOD, MODELS
+from agv_plant.channels import GOOD
+from agv_plant.channels.installed import TRACE, ChannelError, find_model
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import uniforms
@@ -23,14 +24,17 @@ class Channel:
 
     The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot
     0, so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
-    A measured channel's file is read here, once. Raises TraceError if it cannot be used.
+    A measured channel's file is read here, once. Raises TraceError if it cannot be used, ChannelError for a model of
+    another package that cannot be loaded.
     """
 
     def __init__(self, parameters: ChannelParameters, seed: int, stream: str) -> None:
         self.parameters = parameters
         self._seed = seed
         self._stream = stream
-        self._trace = load_trace(parameters.trace_file) if parameters.model == "trace" else ()
+        measured = parameters.model == TRACE
+        self._trace = load_trace(parameters.trace_file) if measured else ()
+        self._model = None if measured else find_model(parameters.model)
         self._next = 0
         self._state = GOOD
         self._last = False
@@ -39,13 +43,15 @@ class Channel:
 
     def lost(self, k: int) -> bool:
         """Is the message of slot `k` lost? Slot 0 never is: a run begins with the AGV known to the edge."""
-        if self._trace:
+        if self._model is None:
             return k > 0 and self._measured(k)
         if k < self._next - 1:
             self._next, self._state = 0, GOOD
-        model = MODELS[self.parameters.model]
         while self._next <= k:
-            lost, self._state = model(self.parameters, self._next, self._uniforms(self._next), self._state)
+            try:
+                lost, self._state = self._model(self.parameters, self._next, self._uniforms(self._next), self._state)
+            except Exception as error:  # another package's model, in which anything can go wrong
+                raise ChannelError(f"channel model {self.parameters.model}, slot {self._next}: {error}") from error
             self._last = lost and self._next > 0
             self._next += 1
         return self._last
@@ -66,7 +72,7 @@ class Channel:
 
 def check_length(parameters: ChannelParameters, steps: float) -> None:
     """Is a trace that may not be outrun long enough for a run of `steps`? Raises TraceError before the run if not."""
-    if parameters.model == "trace" and math.isfinite(steps):
+    if parameters.model == TRACE and math.isfinite(steps):
         Channel(parameters, 0, "").lost(max(0, round(steps) - 1))
 
 

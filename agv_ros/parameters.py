@@ -38,12 +38,16 @@ class Parameter:
     runtime: bool = False
 
     @property
+    def _count(self) -> str:
+        return "one or more" if self.length is None else str(self.length)
+
+    @property
     def allowed(self) -> str:
         """What values are allowed, in words: `in [0, 1]`, `one of hold, align`."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         if self.kind not in ("double", "integer"):
-            return f"{self.length} finite numbers" if self.length else f"a {self.kind}"
+            return f"{self._count} finite numbers" if self.kind == "double_array" else f"a {self.kind}"
         if self.above is not None and self.high is None:
             return f"> {self.above:g} and finite"
         left = f"({self.above:g}" if self.above is not None else "(-inf" if self.low is None else f"[{self.low:g}"
@@ -87,14 +91,14 @@ class Parameter:
 
     def _check_array(self, where: str, value: object) -> tuple[float, ...]:
         if not hasattr(value, "__iter__") or isinstance(value, str):
-            raise ParameterError(f"{where} is a list of {self.length} doubles, got {value!r}")
+            raise ParameterError(f"{where} is a list of {self._count} doubles, got {value!r}")
         numbers = list(value)
         for number in numbers:
             if isinstance(number, int) and not isinstance(number, bool):
                 raise ParameterError(f"{where} is a list of doubles, got the integer {number}: write {number}.0")
             if not isinstance(number, float) or not math.isfinite(number):
                 raise ParameterError(f"{where} must be {self.allowed}, got {numbers!r}")
-        if len(numbers) != self.length:
+        if not numbers if self.length is None else len(numbers) != self.length:
             raise ParameterError(f"{where} must be {self.allowed}, got {len(numbers)}: {numbers!r}")
         return tuple(numbers)
 
@@ -109,15 +113,16 @@ def parameter(
     above: float | None = None,
     choices: tuple[str, ...] = (),
     runtime: bool = False,
+    any_length: bool = False,
 ) -> T:
     """Dataclass field for one parameter.
 
     `low` and `high` are included, `above` is not; a double is finite unless `high` is inf. A `runtime` parameter can be
-    changed while the node runs. A tuple default makes a double_array of that length.
+    changed while the node runs. A tuple default makes a double_array of that length, or of any but 0.
     """
     known = {
         "description": description, "unit": unit, "low": low, "high": high, "above": above, "choices": choices,
-        "runtime": runtime,
+        "runtime": runtime, "any_length": any_length,
     }  # fmt: skip
     return dataclasses.field(default=default, metadata={"parameter": known})
 
@@ -138,13 +143,15 @@ def parameters_of(schema: type) -> dict[str, Parameter]:
             for name, inner in parameters_of(field.metadata["group"]).items():
                 found[f"{field.name}.{name}"] = dataclasses.replace(inner, name=f"{field.name}.{name}")
             continue
-        length = len(field.default) if isinstance(field.default, tuple) else None
+        known = dict(field.metadata["parameter"])
+        free = known.pop("any_length")
+        length = len(field.default) if isinstance(field.default, tuple) and not free else None
         found[field.name] = Parameter(
             name=field.name,
             kind=_KINDS[type(field.default)],
             default=field.default,
             length=length,
-            **field.metadata["parameter"],
+            **known,
         )
     return found
 

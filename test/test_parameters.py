@@ -32,7 +32,7 @@ EVERY_PARAMETER = [
     for name, found in parameters_of(schema).items()
 ]
 
-PROBABILITIES = tuple(f"{link}.{name}" for link in ("uplink", "downlink") for name in "prhk")
+UNITLESS = ("speed_scale", *(f"{link}.{name}" for link in ("uplink", "downlink") for name in (*"prhk", "arguments")))
 """The only doubles without a unit."""
 
 
@@ -53,7 +53,7 @@ def test_every_parameter_is_described(found: Parameter) -> None:
     assert len(found.description) > 10
     assert found.check("node", found.default) == found.default
     if found.kind in ("double", "double_array"):
-        assert bool(found.unit) == (found.name not in PROBABILITIES)
+        assert bool(found.unit) == (found.name not in UNITLESS)
     else:
         assert not found.unit
 
@@ -72,7 +72,7 @@ def test_every_double_refuses_what_is_no_number_and_what_is_an_integer(found: Pa
     assert refusal(found, 25).endswith("is a double, got the integer 25: write 25.0")
     for value in (True, "25.0", None, [1.0], 1 + 0j):
         assert refusal(found, value).endswith(f"is a double, got {value!r}")
-    if found.name not in ("v_max", "duration"):
+    if found.name not in ("v_max", "duration", "w_max", "a_max"):
         assert "got inf" in refusal(found, math.inf)
     else:
         assert found.check("node", math.inf) == math.inf
@@ -111,7 +111,19 @@ def test_every_string_refuses_numbers_and_names_its_choices(found: Parameter) ->
         assert all(found.check("node", choice) == choice for choice in found.choices)
 
 
-@pytest.mark.parametrize("found", [p for p in EVERY_PARAMETER if p.values[0].kind == "double_array"])  # type: ignore[union-attr]
+ARRAYS = [p for p in EVERY_PARAMETER if p.values[0].kind == "double_array"]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("found", [p for p in ARRAYS if p.values[0].length is None])  # type: ignore[union-attr]
+def test_an_array_of_any_length_has_one_number_at_least(found: Parameter) -> None:
+    assert found.check("node", [1.0]) == (1.0,)
+    assert found.check("node", np.arange(9.0)) == tuple(map(float, range(9)))
+    assert refusal(found, []).endswith("must be one or more finite numbers, got 0: []")
+    assert refusal(found, 1.0).endswith("is a list of one or more doubles, got 1.0")
+    assert refusal(found, [math.nan]).endswith("must be one or more finite numbers, got [nan]")
+
+
+@pytest.mark.parametrize("found", [p for p in ARRAYS if p.values[0].length is not None])  # type: ignore[union-attr]
 def test_every_array_is_of_finite_doubles_and_of_one_length(found: Parameter) -> None:
     assert found.check("node", np.array([1.0, 2.0, 3.0])) == found.check("node", [1.0, 2.0, 3.0]) == (1.0, 2.0, 3.0)
     assert refusal(found, [1.0, 2.0]).endswith("must be 3 finite numbers, got 2: [1.0, 2.0]")
@@ -134,7 +146,9 @@ def test_what_can_change_while_running() -> None:
     }
     gains = {f"controller.{name}" for name in ("kx", "ky", "ktheta", "v_max")}
     losses = {
-        f"relay.{link}.{name}" for link in ("uplink", "downlink") for name in ("p", "r", "h", "k", "n", "start_step")
+        f"relay.{link}.{name}"
+        for link in ("uplink", "downlink")
+        for name in ("p", "r", "h", "k", "n", "start_step", "arguments")
     }
     assert changing == gains | losses
 

@@ -109,7 +109,8 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
         assert found.high is not None
         return st.integers(int(found.low), int(found.high))
     if found.kind == "double_array":
-        return st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * (found.length or 0))
+        numbers, length = st.floats(allow_nan=False, allow_infinity=False), found.length
+        return st.lists(numbers, min_size=length or 1, max_size=length or 9).map(tuple)
     return st.sampled_from(found.choices) if found.choices else st.text()
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.simulation.compiled import compiled, numbers
 from agv_plant.channels import GOOD, MODELS
+from agv_plant.channels.installed import TRACE, find_model
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import losses
 from agv_plant.random_stream import uniforms
@@ -41,18 +42,24 @@ class Air:
         return self._verdicts(channel, stream)
 
     def _judge(self, channel: ChannelParameters, stream: str) -> Verdicts:
-        if channel.model == "trace":  # nothing to compute
+        if channel.model == TRACE:  # nothing to compute
             return losses(channel, self._seed, stream, self._steps)
         lost = np.zeros(self._steps, dtype=np.bool_)
         if channel.model != "perfect":  # which needs no random numbers
             parameters = _Numbers(*(getattr(channel, name) for name in _NUMERIC))
-            _judge_all(channel.model)(parameters, numbers(self._uniforms(stream)), lost)
+            try:
+                _judge_all(channel.model)(parameters, numbers(self._uniforms(stream)), lost)
+            except Exception:
+                if channel.model in MODELS:
+                    raise
+                # Another package's model may be more than numba compiles: slot by slot it is the same, or says why not.
+                return losses(channel, self._seed, stream, self._steps)
         return lost
 
 
 @functools.cache
 def _judge_all(name: str) -> Callable[[Any, Any, Verdicts], None]:
-    model: Any = MODELS[name]
+    model: Any = find_model(name)
 
     def judge_all(channel: Any, random: Any, lost: Verdicts) -> None:
         state = GOOD

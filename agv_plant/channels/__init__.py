@@ -2,7 +2,7 @@
 
 One module a model. Each is a scalar function of its parameters, of the slot's uniform random numbers and, where the
 channel has a memory, of its state before the slot; the function also gives the state after it. `MODELS` names them all,
-but for `trace`, whose verdicts were measured and stand in a file.
+but for `trace`, whose verdicts were measured and stand in a file, and those of other packages (`installed`).
 """
 
 from __future__ import annotations
