@@ -77,7 +77,9 @@ def told(run: Run) -> Iterator[tuple[str, str]]:
     yield "Oldest pose", f"{n} steps ({n * ts * 1e3:g} ms)"
     yield "Paper's test", _of_paper(run)
     v, w = run.reference[:, 3], run.reference[:, 4]
-    if run.scenario.error_detector.policy == "predict":
+    predicts = run.scenario.error_detector.policy == "predict"
+    but = ", without the predictor" if predicts else ""
+    if predicts:
         yield "Pose always that old", "predicted: with an exact model as without outages"
     else:
         some = np.linspace(0, len(v) - 1, _PLACES).astype(np.int64)
@@ -85,11 +87,11 @@ def told(run: Run) -> Iterator[tuple[str, str]]:
         yield "Pose always that old", f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
     top = float(np.abs(v).max())
     along, across = bursts.largest_n_along(ts * gains.kx), bursts.largest_n_across(top, gains, ts)
-    yield "Straight track, any outages", f"up to {_n(along)} along, {_n(across)} across"
+    yield "Straight track, any outages", f"up to {_n(along)} along, {_n(across)} across{but}"
     delay = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(top, gains, ts))
-    yield "Straight track, delay", f"below {delay * ts * 1e3:.4g} ms" if delay > 0.0 else "none"
+    yield "Straight track, delay", f"below {delay * ts * 1e3:.4g} ms{but}" if delay > 0.0 else "none"
     loss = mean_square.critical_loss_along(ts * gains.kx)
-    yield "Independent losses, mean square", f"below {loss:.4g}" if loss > 0.0 else "none"
+    yield "Independent losses, mean square", f"below {loss:.4g}{but}" if loss > 0.0 else "none"
     binds = binding(top, gains, ts)
     yield "What binds", "nothing" if binds is None else f"the error {binds} the track"
 
