@@ -31,6 +31,7 @@ setup(
     install_requires=[
         "setuptools",
         "click>=8.1",
+        "isal>=1.1",
         "jinja2>=3.0",
         "matplotlib>=3.6",
         "lz4>=4.0",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zlib
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Bytes, Ints, numbers_at
+from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
 from agv_analysis.bags.errors import DamagedError
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Read, has_shape, is_known
@@ -58,7 +58,7 @@ def open_chunk(chunk: Chunk) -> bytes:
     """
     try:
         content = inflate(chunk.compression, chunk.content, chunk.size)
-        if chunk.crc and zlib.crc32(content) != chunk.crc:
+        if chunk.crc and crc32(content) != chunk.crc:
             raise DamagedError("its content does not match its CRC")
         if not chunk.crc and len(content) != chunk.size:
             raise DamagedError(f"it inflates to {len(content)} bytes where {chunk.size} are declared")
@@ -68,7 +68,7 @@ def open_chunk(chunk: Chunk) -> bytes:
         compression = compression_of(chunk.content)
         size = declared_size(compression, chunk.content) if compression else len(chunk.content)
         content = inflate_start(compression, chunk.content, min(MAX_CHUNK, size or chunk.size))
-        if zlib.crc32(content) != chunk.crc:
+        if crc32(content) != chunk.crc:
             raise
     return content
 

@@ -13,7 +13,6 @@ Python's lock.
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agv_analysis.bags.batch import Batch, Bytes, Ints
+from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.chunk import (
     Content,
     Definition,
@@ -238,7 +238,7 @@ class McapFile:
     def _crc(self, begin: int, end: int) -> int:
         crc = 0
         for position in range(begin, end, _WINDOW):
-            crc = zlib.crc32(self._source.read(position, min(_WINDOW, end - position)), crc)
+            crc = crc32(self._source.read(position, min(_WINDOW, end - position)), crc)
         return crc
 
     def _check_data_section(self, end: int) -> None:
@@ -304,7 +304,7 @@ class McapFile:
 
     def _take_attachment(self, record: Record) -> None:
         attachment, crc = parse_attachment(record.content)
-        if crc and zlib.crc32(record.content[:-4]) != crc:
+        if crc and crc32(record.content[:-4]) != crc:
             self.findings.add("attachment that does not match its CRC, left out", at=record.position, is_loss=True)
         elif self._keep_attachments:
             self.attachments.append(attachment)
