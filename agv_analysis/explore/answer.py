@@ -18,8 +18,8 @@ from agv_analysis.simulation.single import simulate
 from agv_analysis.stability import bursts, lifted, mean_square, paper
 from agv_analysis.stability.margins import binding
 
-_MOST_POINTS = 2000
-"""Points of a line: about two a pixel."""
+_MOST_POINTS = 1200
+"""Points of a line: the lowest and the highest of each pixel or two."""
 
 _PLACES = 100
 """Places of the track at which the lifted system is asked: all of them would take longer than the lap."""

@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import groupby, zip_longest
-from pathlib import Path
 from typing import get_type_hints
 
 import numpy as np
@@ -18,10 +17,9 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Case, Statistics, at_rest, statistics, statistics_of_twins, statistics_of_two
-from agv_analysis.simulation.single import settings_of, steps_of
+from agv_analysis.simulation.single import reference_of, settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference
 
 STATISTICS = np.dtype([
     *((name, np.dtype(kind)) for name, kind in get_type_hints(Statistics).items()), ("contraction", np.dtype(float))
@@ -121,7 +119,8 @@ class _Batch:
 
     def _reference(self, row: int) -> Floats:
         detector = self._scenarios[row].error_detector
-        return _reference(detector, self._steps[row], _edition(detector.track_file))
+        reference: Floats = numbers(reference_of(detector, self._steps[row]))
+        return reference
 
     def _case(self, job: Job, airs: Airs) -> Case:
         row, column = job
@@ -132,19 +131,3 @@ class _Batch:
             at_rest(*scenario.plant.initial_pose),
             settings_of(scenario),
         )
-
-
-@functools.lru_cache(maxsize=8)
-def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -> Floats:
-    """A reference track's first steps; kept, since the parts of a sweep ask for the same one again and again."""
-    reference: Floats = numbers(Reference(detector).first(steps))
-    return reference
-
-
-def _edition(path: str) -> object:
-    """What changes when a file does; None if there is no such file."""
-    try:
-        found = Path(path).stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +12,7 @@ from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Case, Settings, at_rest, history
+from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
 from agv_cloud.staleness import POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
@@ -29,7 +32,7 @@ def simulate(scenario: Scenario) -> Run:
     ends there, and its run says so in its notes.
     """
     steps, relay = steps_of(scenario), scenario.relay
-    reference = Reference(scenario.error_detector).first(steps)
+    reference = reference_of(scenario.error_detector, steps).copy()
     lost = losses(relay.uplink, relay.seed, "uplink", steps)
     downlink_lost = losses(relay.downlink, relay.seed, "downlink", steps)
     rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
@@ -49,6 +52,28 @@ def simulate(scenario: Scenario) -> Run:
         downlink_lost=downlink_lost[:done],
         notes=tuple(_notes(scenario, done, steps, rows[:done, 6:8])),
     )
+
+
+def reference_of(detector: ErrorDetectorParameters, steps: int) -> Floats:
+    """A reference track's first steps, shape (steps, 5); kept, since many runs ask for the same. Not to be written to.
+
+    Raises TrackFileError for a bad track file.
+    """
+    return _reference(detector, steps, _edition(detector.track_file))
+
+
+@functools.lru_cache(maxsize=8)
+def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -> Floats:
+    return Reference(detector).first(steps)
+
+
+def _edition(path: str) -> object:
+    """What changes when a file does; None if there is no such file."""
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
 
 
 def steps_of(scenario: Scenario) -> int:
