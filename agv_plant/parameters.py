@@ -81,6 +81,9 @@ class ChannelParameters:
         "trace: what follows its last slot; repeat: the first, hold: no more losses, stop: an error",
         choices=ENDS,
     )
+    correlation: float = parameter(
+        0.0, "downlink: share of slots in which it draws the uplink's random numbers; 1: one fate", low=0.0, high=1.0
+    )
     arguments: tuple[float, ...] = parameter(
         (0.0,), "a model of another package: whatever numbers it takes", any_length=True, runtime=True
     )

@@ -18,6 +18,22 @@ from agv_ros.wire import DELIVERED, LOST, Slot
 
 _BLOCK = 4096
 
+UPLINK = "uplink"
+"""The stream from which a correlated channel takes its random numbers."""
+
+
+def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
+    """Random numbers of a channel's slots first .. first + count - 1, uniform in [0, 1), shape (count, DRAWS).
+
+    In a share `correlation` of the slots they are those of the uplink. Of two equal channels without memory the losses
+    then have exactly this correlation coefficient.
+    """
+    own = uniforms(seed, stream, first, count)
+    if parameters.correlation == 0.0:
+        return own
+    shared = uniforms(seed, f"{stream}/correlation", first, count)[:, :1] < parameters.correlation
+    return np.where(shared, uniforms(seed, UPLINK, first, count), own)
+
 
 class Channel:
     """Verdicts of one channel, a pure function of (parameters, seed, stream name, k).
@@ -65,7 +81,7 @@ class Channel:
     def _uniforms(self, k: int) -> Sequence[float]:
         first = k - k % _BLOCK
         if first != self._first_of_block:
-            self._block = uniforms(self._seed, self._stream, first, _BLOCK).tolist()
+            self._block = draws(self.parameters, self._seed, self._stream, first, _BLOCK).tolist()
             self._first_of_block = first
         return self._block[k - first]
 
@@ -83,18 +99,29 @@ def losses(parameters: ChannelParameters, seed: int, stream: str, steps: int) ->
 
 
 class Link:
-    """A channel and the memory of the receiver behind it."""
+    """A channel, the memory of the receiver behind it, and a count of what became of the messages."""
 
     def __init__(self, channel: Channel, grid: Grid) -> None:
         self.channel = channel
         self._steps = Steps(grid)
         self._freshest_ns = 0
+        self.sent = 0
+        self.lost = 0
+        self.longest = 0
+        """Most messages lost in a row."""
+        self._run = 0
 
     def transmit(self, stamp_ns: int) -> Slot:
         """The slot of the message with this stamp. Raises OffGridError if the stamp is no sampling instant."""
         k = self._steps.of(stamp_ns)
         lost = self.channel.lost(k)
-        if not lost:
+        self.sent += 1
+        if lost:
+            self.lost += 1
+            self._run += 1
+            self.longest = max(self.longest, self._run)
+        else:
+            self._run = 0
             # Step 0 begins a run: whatever is held of a run before it is not fresher.
             self._freshest_ns = stamp_ns if k == 0 else max(self._freshest_ns, stamp_ns)
         return Slot(stamp_ns, self._freshest_ns, LOST if lost else DELIVERED)

@@ -38,10 +38,24 @@ class RelayNode(LoopNode[RelayParameters]):
     def _on_command(self, data: bytes) -> None:
         _pass_on(data, self.downlink.transmit(stamp_of(data)), self._agv_cmd_vel, self._agv_slot)
 
+    def facts(self) -> dict[str, str]:
+        """What each link did to its messages so far."""
+        return _counts("uplink", self.uplink) | _counts("downlink", self.downlink)
+
     def on_settings(self) -> None:
         """Changed loss parameters hold from the next slot on."""
         self.uplink.channel.parameters = self.settings.uplink
         self.downlink.channel.parameters = self.settings.downlink
+
+
+def _counts(name: str, link: Link) -> dict[str, str]:
+    rate = link.lost / link.sent if link.sent else 0.0
+    return {
+        f"{name} sent": str(link.sent),
+        f"{name} lost": str(link.lost),
+        f"{name} loss rate": f"{rate:.6f}",
+        f"{name} longest outage": str(link.longest),
+    }
 
 
 def _pass_on(data: bytes, slot: Slot, forward: Output, verdict: Output) -> None:

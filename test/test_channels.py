@@ -6,6 +6,7 @@ p-value of 1e-4.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from itertools import groupby
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chisquare, norm
 
+from agv_analysis.simulation.verdicts import Air
 from agv_plant.channels import MODELS
 from agv_plant.channels.bernoulli import bernoulli
 from agv_plant.channels.burst import burst
@@ -267,3 +269,32 @@ def test_the_same_source_gives_the_same_verdicts(model: str) -> None:
     first, second = (losses(EVERY_MODEL[model], 3, "uplink", 5000) for _ in range(2))
     assert (first == second).all()
     assert not first[0]
+
+
+# -- the downlink's fate shared with the uplink's ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.8, 1.0])
+def test_a_correlated_downlink_has_its_correlation_and_its_own_loss_rate(share: float) -> None:
+    p = 0.3
+    up = losses(ChannelParameters(model="bernoulli", p=p), 4, "uplink", STEPS).astype(float)
+    down = losses(ChannelParameters(model="bernoulli", p=p, correlation=share), 4, "downlink", STEPS).astype(float)
+    assert abs(down.mean() - p) < 5.0 * math.sqrt(p * (1.0 - p) / STEPS)
+    assert abs(np.corrcoef(up, down)[0, 1] - share) < 5.0 / math.sqrt(STEPS)
+    # Both lost: c p + (1 - c) p^2.
+    both = share * p + (1.0 - share) * p * p
+    assert abs((up * down).mean() - both) < 5.0 * math.sqrt(both * (1.0 - both) / STEPS)
+
+
+@pytest.mark.parametrize("model", ["bernoulli", "gilbert_elliott"])
+def test_a_downlink_of_the_same_fate_loses_what_the_uplink_loses(model: str) -> None:
+    channel = dataclasses.replace(EVERY_MODEL[model], correlation=1.0)
+    assert (losses(channel, 2, "downlink", 5000) == losses(EVERY_MODEL[model], 2, "uplink", 5000)).all()
+    assert (losses(channel, 2, "uplink", 5000) == losses(EVERY_MODEL[model], 2, "uplink", 5000)).all()
+
+
+@pytest.mark.parametrize("stream", ["uplink", "downlink"])
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_the_simulation_draws_the_same_correlated_numbers(stream: str, share: float) -> None:
+    channel = dataclasses.replace(EVERY_MODEL["gilbert_elliott"], correlation=share)
+    assert (Air(7, 9000).verdicts(channel, stream) == losses(channel, 7, stream, 9000)).all()

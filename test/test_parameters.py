@@ -32,7 +32,10 @@ EVERY_PARAMETER = [
     for name, found in parameters_of(schema).items()
 ]
 
-UNITLESS = ("speed_scale", *(f"{link}.{name}" for link in ("uplink", "downlink") for name in (*"prhk", "arguments")))
+UNITLESS = (
+    "speed_scale",
+    *(f"{link}.{name}" for link in ("uplink", "downlink") for name in (*"prhk", "arguments", "correlation")),
+)
 """The only doubles without a unit."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -122,3 +123,14 @@ def test_a_message_beside_the_grid_takes_no_slot(stamp_ns: int) -> None:
         with pytest.raises(OffGridError):
             radio.transmit(stamp_ns)
         assert radio.transmit(GRID.stamp(k)) == undisturbed.transmit(GRID.stamp(k))
+
+
+@settings(deadline=None, derandomize=True, max_examples=60)
+@given(parameters, st.integers(1, 200))
+def test_a_link_counts_what_became_of_its_messages(c: ChannelParameters, steps: int) -> None:
+    lost = losses(c, 1, "uplink", steps)
+    radio = link(c)
+    for k in range(steps):
+        radio.transmit(GRID.stamp(k))
+    runs = [sum(1 for _ in group) for value, group in groupby(lost.tolist()) if value]
+    assert (radio.sent, radio.lost, radio.longest) == (steps, lost.sum(), max(runs, default=0))

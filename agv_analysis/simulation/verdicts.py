@@ -19,8 +19,7 @@ from agv_analysis.simulation.compiled import compiled, numbers
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.installed import TRACE, find_model
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
-from agv_plant.random_stream import uniforms
+from agv_plant.radio import draws, losses
 
 Verdicts = NDArray[np.bool_]
 
@@ -34,7 +33,7 @@ class Air:
     def __init__(self, seed: int, steps: int) -> None:
         self._steps = steps
         self._seed = seed
-        self._uniforms = functools.cache(lambda stream: uniforms(seed, stream, 0, steps))
+        self._shared = functools.cache(lambda stream: draws(ChannelParameters(), seed, stream, 0, steps))
         self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
 
     def verdicts(self, channel: ChannelParameters, stream: str) -> Verdicts:
@@ -48,13 +47,18 @@ class Air:
         if channel.model != "perfect":  # which needs no random numbers
             parameters = _Numbers(*(getattr(channel, name) for name in _NUMERIC))
             try:
-                _judge_all(channel.model)(parameters, numbers(self._uniforms(stream)), lost)
+                _judge_all(channel.model)(parameters, numbers(self._draws(channel, stream)), lost)
             except Exception:
                 if channel.model in MODELS:
                     raise
                 # Another package's model may be more than numba compiles: slot by slot it is the same, or says why not.
                 return losses(channel, self._seed, stream, self._steps)
         return lost
+
+    def _draws(self, channel: ChannelParameters, stream: str) -> NDArray[np.float64]:
+        if channel.correlation == 0.0:
+            return self._shared(stream)
+        return draws(channel, self._seed, stream, 0, self._steps)
 
 
 @functools.cache
