@@ -386,3 +386,69 @@ def test_command_line(tmp_path: Path, truth: Run, agv_ncs: Callable[..., tuple[i
     status, output = agv_ncs("analyse", bag, "--pose-topic", "/nothing", "--reference-topic", "/plan")
     assert status == 1
     assert "no topic /nothing" in output
+    status, output = agv_ncs("analyse", bag, *names, "--namespace", "robot1")
+    assert status == 2
+    assert "topics are named in full" in output
+
+
+def as_gazebo_records(path: Path, plugin: StoragePlugin, sent: int, lost: set[int]) -> Path:
+    """A TurtleBot3 in Gazebo: odometry at 30 Hz on whole milliseconds of a slow simulated clock, logged by the wall's.
+
+    Infinite ranges, texts of any length, transforms of many frames, a command without stamp at a third of the rate.
+    """
+    made, random_numbers, begun = Recording(), np.random.default_rng(3), 1_750_000_000_000_000_000
+    covariance = np.diag([1e-5, 1e-5, 1e12, 1e12, 1e12, 1e-3]).ravel()
+    for k in range(sent):
+        stamp = round((12.345 + k / 30.0) * 1e3) * 1_000_000
+        log, pose = (
+            begun + int(stamp / 0.97) + int(random_numbers.integers(4_000_000)),
+            posture(0.2 * k / 30.0, 0.1, 0.0),
+        )
+        if k not in lost:
+            message = odometry(stamp, pose, 0.2)
+            message.pose.covariance[:] = covariance
+            made.add("/odom", log, message)
+        if k % 3 == 0:
+            made.add("/cmd_vel", log + 1_000_000, twist(0.2, 0.0))
+        links = ["base_footprint", "wheel_left_link", "caster_back_link"][: 1 + k % 3]
+        transform = make("geometry_msgs/msg/Transform", translation=vector(0.2, 0.1), rotation=pose.orientation)
+        transforms = [
+            make("geometry_msgs/msg/TransformStamped", header=header(stamp), child_frame_id=link, transform=transform)
+            for link in links
+        ]
+        made.add("/tf", log, make("tf2_msgs/msg/TFMessage", transforms=transforms))
+        if k % 6 == 0:
+            made.add("/scan", log, scan(stamp, np.where(random_numbers.random(360) < 0.2, np.inf, 1.0)))
+        if k % 50 == 0:
+            made.add("/rosout", log, said(stamp, "x" * int(random_numbers.integers(5, 200))))
+    points = [stamped(0, posture(x, 0.0, 0.0)) for x in np.linspace(0.0, 12.0, 60)]
+    made.add("/plan", begun + 12 * 10**9, make("nav_msgs/msg/Path", header=header(12 * 10**9), poses=points))
+    return made.write(path, plugin)
+
+
+def scan(stamp: int, ranges: Any) -> Any:
+    return make(
+        "sensor_msgs/msg/LaserScan", header=header(stamp, "base_scan"), angle_min=0.0, angle_max=6.28,
+        angle_increment=0.0175, time_increment=0.0, scan_time=0.0, range_min=0.12, range_max=3.5,
+        ranges=ranges.astype(np.float32), intensities=np.zeros(360, np.float32),
+    )  # fmt: skip
+
+
+def said(stamp: int, text: str) -> Any:
+    time = header(stamp).stamp
+    return make(
+        "rcl_interfaces/msg/Log", stamp=time, level=20, name="diff_drive", msg=text, file="a.cpp", function="f", line=3
+    )
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_a_robot_in_gazebo(tmp_path: Path, plugin: StoragePlugin) -> None:
+    lost = {7, 50, 51, 52, 200, 431}
+    run = read_robot_run(as_gazebo_records(tmp_path / "bag", plugin, 600, lost), ALL)
+    assert set(np.flatnonzero(run.lost).tolist()) == lost
+    assert run.ts == pytest.approx(1.0 / 30.0, abs=1e-3 / 599)  # stamps are whole milliseconds
+    assert run.pose[:, 1] == pytest.approx(0.1)
+    assert run.command[5:, 0] == pytest.approx(0.2)
+    assert run.reference[:, 1] == pytest.approx(0.0)
+    found = observe(run).to_json()
+    assert (found["n_ul_max"], found["max_error"]) == (3, pytest.approx(0.1, abs=1e-6))
