@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 
@@ -18,6 +19,7 @@ class Findings:
     """Everything that was lost, that could not be checked, or that is not as it should be."""
 
     _kinds: dict[str, _Kind] = field(default_factory=dict)
+    _unchecked: Counter[str] = field(default_factory=Counter)
 
     def add(
         self, what: str, count: int = 1, *, at: int | None = None, messages: int = 0, is_loss: bool = False
@@ -28,10 +30,15 @@ class Findings:
         kind.messages += messages
         kind.is_loss |= is_loss
 
+    def add_unchecked(self, what: str, count: int = 1) -> None:
+        """Count something of the kind `what` that is used although no CRC covers it."""
+        self._unchecked[what] += count
+
     def merge(self, other: Findings) -> None:
         """Take over what another reader found."""
         for what, kind in other._kinds.items():
             self.add(what, kind.count, at=kind.first, messages=kind.messages, is_loss=kind.is_loss)
+        self._unchecked += other._unchecked
 
     @property
     def is_loss(self) -> bool:
@@ -39,8 +46,10 @@ class Findings:
         return any(kind.is_loss for kind in self._kinds.values())
 
     def texts(self) -> tuple[str, ...]:
-        """One line for each kind."""
-        return tuple(_text(what, kind) for what, kind in self._kinds.items())
+        """One line for each kind, and one for all that no CRC covers."""
+        found = tuple(_text(what, kind) for what, kind in self._kinds.items())
+        unchecked = ", ".join(f"{what}: {count}" for what, count in self._unchecked.items())
+        return (*found, f"not checked, for want of a CRC: {unchecked}") if unchecked else found
 
 
 def _text(what: str, kind: _Kind) -> str:

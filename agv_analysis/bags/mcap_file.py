@@ -171,7 +171,7 @@ class McapFile:
             self.position = item.position
             if isinstance(item, _Run):
                 if not self._is_proven:
-                    self.findings.add("message outside of chunks, which no CRC covers", len(item.starts))
+                    self.findings.add_unchecked("messages outside of chunks", len(item.starts))
                 buffer = np.frombuffer(item.content, np.uint8)
                 messages = messages_at(buffer, np.array(item.starts, np.int64))
                 yield from self._split(buffer, by_channel(messages), is_wanted)
@@ -294,7 +294,7 @@ class McapFile:
                 name, content = parse_metadata(record.content)
                 self.metadata[name] = content
                 if not self._is_proven:
-                    self.findings.add("metadata record, which no CRC covers")
+                    self.findings.add_unchecked("metadata records")
             elif record.opcode == ATTACHMENT:
                 self._take_attachment(record)
             else:
@@ -403,7 +403,7 @@ class McapFile:
             self.findings.add(f"damaged chunk, left out ({error})", at=position, messages=number, is_loss=True)
             return
         if not chunk.crc:
-            self.findings.add("chunk without a CRC, whose content is not checked")
+            self.findings.add_unchecked("chunks")
         elif not is_as_declared(chunk, content):
             self.findings.add("chunk that misstates its size or compression, read all the same", at=position)
         if packed.places and not is_by_index:
