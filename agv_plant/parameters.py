@@ -74,7 +74,8 @@ class ChannelParameters:
         high=2**62, runtime=True,
     )  # fmt: skip
     trace_file: str = parameter(
-        "", "trace: CSV file with a row a slot, column lost (0, 1) or verdict (delivered, lost)"
+        "",
+        "trace: CSV file with a row a slot, column lost (0, 1) or verdict (delivered, lost); or JSON, a list so called",
     )
     trace_end: str = parameter(
         "repeat",

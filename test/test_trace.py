@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.simulation.verdicts import Air
-from agv_plant.channels.trace import TraceError, parse_trace, trace
+from agv_plant.channels.trace import TraceError, load_trace, parse_json_trace, parse_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import Channel, losses
 from agv_ros.parameters import ParameterError
@@ -161,3 +162,47 @@ def test_a_relay_at_the_end_of_its_trace_ends(measured: Path, start: Start) -> N
     status, said = start("agv_plant.relay_node", *connected, *options).end()
     assert status == 1
     assert "the trace ends after 7 slots, and slot 7 is asked for" in said
+
+
+# -- JSON, and what is no trace ----------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.lists(st.booleans(), min_size=1), st.sampled_from(["flags", "numbers", "words"]))
+def test_what_was_written_as_json_is_read(lost: list[bool], how: str) -> None:
+    column = "verdict" if how == "words" else "lost"
+    values = {"flags": lost, "numbers": [*map(int, lost)], "words": [("delivered", "lost")[one] for one in lost]}
+    assert parse_json_trace(json.dumps({column: values[how], "note": "x"}), "file.json") == tuple(lost)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{\n  oops", "file.json:2: Expecting property name"),
+        ("[0, 1]", "file.json: must be an object with one list called lost or verdict"),
+        ('{"loss": [0]}', "file.json: must be an object with one list called lost or verdict"),
+        ('{"lost": 0}', "file.json: must be an object with one list called lost or verdict"),
+        ('{"lost": [0], "verdict": ["lost"]}', "file.json: must be an object with one list called lost or verdict"),
+        ('{"lost": []}', "file.json: the list lost is empty"),
+        ('{"lost": [0, 2]}', "file.json: lost[1]: lost must be 0 or 1, found '2'"),
+        ('{"lost": [0, null]}', "file.json: lost[1]: lost must be 0 or 1, found 'None'"),
+        ('{"verdict": ["lost", "LOST"]}', "file.json: verdict[1]: verdict must be delivered or lost, found 'LOST'"),
+    ],
+)
+def test_a_json_file_that_is_no_trace_is_refused(text: str, complaint: str) -> None:
+    with pytest.raises(TraceError) as caught:
+        parse_json_trace(text, "file.json")
+    assert str(caught.value).startswith(complaint)
+
+
+def test_the_same_trace_from_both_kinds_of_file(measured: Path, tmp_path: Path) -> None:
+    path = tmp_path / "measured.json"
+    path.write_text(json.dumps({"lost": MEASURED}))
+    assert load_trace(str(path)) == load_trace(str(measured)) == tuple(MEASURED)
+
+
+@pytest.mark.parametrize("recording", ["bags/sample", "somewhere/run_0.mcap"])
+def test_a_recording_is_no_trace_and_the_error_says_how_to_make_one(recording: str) -> None:
+    path = str(REPOSITORY / recording)
+    with pytest.raises(TraceError, match=r"is a recording; make a trace of it with agv-ncs replay .* --outages FILE"):
+        load_trace(path)

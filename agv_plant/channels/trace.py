@@ -1,9 +1,11 @@
-"""A channel that was measured: the verdicts of a CSV file, slot by slot."""
+"""A channel that was measured: the verdicts of a CSV or JSON file, slot by slot."""
 
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from agv_ros.errors import UserError, open_text
 
@@ -70,7 +72,35 @@ def _verdict(cells: dict[str, str], column: str, k: int, where: str) -> bool:
     return words[found]
 
 
+def parse_json_trace(text: str, name: str) -> tuple[bool, ...]:
+    """Verdicts from the text of a JSON file called `name` in messages, True where lost.
+
+    An object with one list called `lost` (of 0 or 1) or `verdict` (of "delivered" or "lost"), an element a slot. Other
+    members are passed over. Raises TraceError naming the line of broken JSON, or the element.
+    """
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise TraceError(f"{name}:{error.lineno}: {error.msg}") from None
+    named = [column for column in _WORDS if column in content] if isinstance(content, dict) else []
+    if len(named) != 1 or not isinstance(content[named[0]], list):
+        raise TraceError(f"{name}: must be an object with one list called lost or verdict")
+    column = named[0]
+    cells = [str(int(value)) if isinstance(value, bool) else str(value) for value in content[column]]
+    if not cells:
+        raise TraceError(f"{name}: the list {column} is empty")
+    return tuple(_verdict({column: cell}, column, k, f"{name}: {column}[{k}]") for k, cell in enumerate(cells))
+
+
 def load_trace(path: str) -> tuple[bool, ...]:
-    """Verdicts from a CSV file, as `parse_trace`. Raises TraceError."""
+    """Verdicts from a file whose name ends in .json, as `parse_json_trace`, or from any other, as `parse_trace`.
+
+    Raises TraceError, for a recording too: it has to be turned into a trace first.
+    """
+    if path.endswith(".mcap") or (Path(path) / "metadata.yaml").exists():
+        raise TraceError(f"{path}: is a recording; make a trace of it with agv-ncs replay {path} --outages FILE")
+    if path.endswith(".json"):
+        with open_text(path, TraceError, encoding="utf-8-sig") as file:
+            return parse_json_trace(file.read(), path)
     with open_text(path, TraceError, encoding="utf-8-sig", newline="") as file:
         return parse_trace(file, path)
