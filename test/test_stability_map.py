@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agv_analysis.stability.chain import bernoulli, gilbert_elliott
-from agv_analysis.stability.gains import best_for_bursts, best_for_delay, best_in_mean_square, best_kx
+from agv_analysis.stability.almost_sure import exponent_along
+from agv_analysis.stability.chain import Chain, bernoulli, gilbert_elliott
+from agv_analysis.stability.gains import (
+    best_almost_surely,
+    best_for_bursts,
+    best_for_delay,
+    best_in_mean_square,
+    best_kx,
+)
 from agv_analysis.stability.margin_map import Point, largest_delays, largest_repeated_burst, margin_map
 from agv_ros.errors import UserError
 
@@ -160,6 +168,30 @@ def test_the_best_gain_in_mean_square(p: float) -> None:
     best, rate = best_in_mean_square(bernoulli(p))
     assert rate == pytest.approx(second_moment_rate(best, p), abs=1e-9)
     assert all(second_moment_rate(a, p) >= rate - 1e-9 for a in np.linspace(0.001, 1.99, 500))
+
+
+@pytest.mark.parametrize("chain", [bernoulli(0.0), bernoulli(0.3), bernoulli(0.9), gilbert_elliott(0.02, 0.05)])
+def test_the_best_gain_almost_surely(chain: Chain) -> None:
+    """Against the exponent of many gains within the tolerance, none of which is at a singular point."""
+
+    def averaged(a: float) -> float:
+        cells = 4000
+        within = a * (0.9 + 0.2 * (np.arange(cells) + 0.5) / cells)
+        probabilities = chain.burst_lengths()
+        lengths = np.arange(1, len(probabilities) + 1)
+        logs = [float(np.log(np.abs(1.0 - within * length)).mean()) for length in lengths]
+        return float(probabilities @ logs / (probabilities @ lengths))
+
+    best, rate = best_almost_surely(chain)
+    assert math.isfinite(rate)
+    assert rate == pytest.approx(averaged(best), abs=2e-3)
+    assert all(averaged(float(a)) >= rate - 2e-3 for a in np.geomspace(0.002, 2.0, 80))
+
+
+def test_the_exponent_itself_has_no_best_gain() -> None:
+    """At 1/a = 1, 2, 3 it is -inf, and no finite exponent is below that."""
+    assert [exponent_along(1.0 / length, bernoulli(0.3)) for length in (1, 2, 3)] == [-math.inf] * 3
+    assert math.isfinite(best_almost_surely(bernoulli(0.3))[1])
 
 
 def test_best_gains_in_their_units() -> None:

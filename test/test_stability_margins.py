@@ -111,3 +111,20 @@ def test_the_command(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) ->
     assert found["burst_max"]["mean_square"] == pytest.approx(82.5, rel=1e-4)
     assert "14 steps (70 ms)" in said
     assert said.count("They disagree:") == len(found["disagreements"]) >= 2
+    assert found["best_kx"]["almost_sure"] > 0.0
+    assert "integer" in found["best_kx"]["almost_sure_reason"]
+
+
+def test_a_trace_has_no_best_gain_and_says_why(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    trace, path = tmp_path / "lost.csv", tmp_path / "margins.json"
+    trace.write_text("1\n0\n1\n")
+    settings = ("error_detector.track=line", "relay.uplink.model=trace", f"relay.uplink.trace_file={trace}")
+    status, said = agv_ncs(
+        "stability", "config/paper.yaml", *(word for setting in settings for word in ("--set", setting)), "--json", path
+    )
+    assert status == 0, said
+    found: dict[str, Any] = json.loads(path.read_text())
+    assert found["best_kx"] is None
+    assert "trace" in found["best_kx_reason"]
+    assert "closed form" in found["burst_max"]["mean_square_reason"]
+    assert found["n_max"]["bursts"] == 14

@@ -62,22 +62,34 @@ def command(
     for name, value in rows(found, scenario.plant.ts):
         table.add_row(name, value)
     console.print(table)
-    best = _best_gains(scenario)
+    best, reasons = _best_gains(scenario)
     for objective, kx in best.items():
-        console.print(f"Best K_x, {objective.replace('_', ' ')}: {kx:.4g} 1/s")
+        reason = f" ({reasons[objective]})" if objective in reasons else ""
+        console.print(f"Best K_x, {objective.replace('_', ' ')}: {kx:.4g} 1/s{reason}")
+    if not best:
+        console.print(f"Best K_x: {reasons['best_kx']}")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     if json_file is not None:
-        write_json(json_file, {**found.to_json(), "best_kx": best or None})
+        told = {f"{name}_reason": reason for name, reason in reasons.items()}
+        gains = {"best_kx": {**best, **told}} if best else {"best_kx": None, **told}
+        write_json(json_file, {**found.to_json(), **gains})
 
 
-def _best_gains(scenario: Scenario) -> dict[str, float]:
-    """Best K_x by objective under the scenario's uplink; empty for a channel that is no Markov chain or loses all."""
+def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
+    """Best K_x by objective under the scenario's uplink, and what is to be said of them, by objective.
+
+    No gains for a channel that is no Markov chain or loses all; the reason is that of `best_kx`.
+    """
     from agv_analysis.stability.chain import chain_of
-    from agv_analysis.stability.gains import best_kx
+    from agv_analysis.stability.gains import WHY_A_TOLERANCE, best_kx
 
-    chain = chain_of(scenario.relay.uplink)
-    return best_kx(chain, scenario.plant.ts) if chain is not None and chain.loss_rate < 1.0 else {}
+    chain, model = chain_of(scenario.relay.uplink), scenario.relay.uplink.model
+    if chain is None:
+        return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
+    if chain.loss_rate >= 1.0:
+        return {}, {"best_kx": "no answer: the scenario's uplink loses everything"}
+    return best_kx(chain, scenario.plant.ts), {"almost_sure": WHY_A_TOLERANCE}
 
 
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:
