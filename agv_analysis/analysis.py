@@ -13,6 +13,8 @@ from agv_analysis.outages import Outages, outages
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
+from agv_analysis.stability.linearisation import Edge
+from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED, gains_at_true_speed
 from agv_analysis.stability.verdict import Verdict, judge
 from agv_ros.errors import UserError
 
@@ -100,7 +102,10 @@ class Analysis(Observations):
 
     paper: PaperTest
     lifted_radius: float
-    """Largest spectral radius of the lifted system over the track, for a pose as old as the oldest of the run."""
+    """Largest spectral radius of the lifted system over the track, for a pose as old as the oldest of the run.
+
+    As if it were fresh where it is predicted exactly; NaN where it is predicted by a wrong model.
+    """
     bursts: BurstVerdict
     """Verdict for arbitrary bursts of up to as many lost poses as the longest outage of the run."""
     mean_square_growth: float
@@ -112,9 +117,9 @@ class Analysis(Observations):
     verdict: Verdict
 
     @property
-    def lifted_stable(self) -> bool:
-        """Does the loop contract if every pose is as old as the oldest of the run?"""
-        return self.lifted_radius < 1.0
+    def lifted_stable(self) -> bool | None:
+        """Does the loop contract if every pose is as old as the oldest of the run? None where that is not computed."""
+        return None if np.isnan(self.lifted_radius) else self.lifted_radius < 1.0
 
     @property
     def bursts_stable(self) -> bool:
@@ -124,7 +129,7 @@ class Analysis(Observations):
     def disagreements(self) -> list[str]:
         """A sentence for each pair of criteria that say different things."""
         found = []
-        if self.paper.stable and not self.lifted_stable:
+        if self.paper.stable and self.lifted_stable is False:
             found.append(
                 f"the paper's test calls the loop stable, but a pose that is always {self.n} steps old makes the "
                 f"error grow by a factor {self.lifted_radius:.4f} a step: the test takes the outdated pose for the "
@@ -140,7 +145,7 @@ class Analysis(Observations):
                 f"the paper's test calls the loop unstable (|lambda| = {self.paper.radius:.6g} at step "
                 f"{self.paper.k}), but it contracts under any outages of up to {self.n} slots"
             )
-        if self.bursts_stable and not self.lifted_stable:
+        if self.bursts_stable and self.lifted_stable is False:
             found.append(
                 f"outages of up to {self.n} slots are survived, since a fresh pose follows each; a pose that is always "
                 f"{self.n} steps old is not"
@@ -185,16 +190,21 @@ def analyse(run: Run) -> Analysis:
         raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
     out, fit = outages(run), fit_channel(run.lost)
     v_r, w_r, gains = run.reference[:, 3], run.reference[:, 4], run.scenario.controller
-    growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain) / len(run)
+    edge, true = Edge.of(run.scenario), gains_at_true_speed(run.scenario)
+    growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain, edge=edge) / len(run)
     of_drops, of_motion = _contractions(run)
-    n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts)
+    longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
+    n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
+    n_seen = 0 if edge.is_exact else out.n_ul_max
     return Analysis(
         run=run,
         outages=out,
         convergence=convergence(run),
         paper=paper_test(run),
-        lifted_radius=lifted.largest_radius(out.n_ul_max, v_r, w_r, gains, run.ts),
-        bursts=bursts.verdict(out.n_ul_max, v_r, w_r, gains, run.ts),
+        lifted_radius=(
+            np.nan if edge.predicts and not edge.is_exact else lifted.largest_radius(n_seen, v_r, w_r, true, run.ts)
+        ),
+        bursts=bursts.verdict(out.n_ul_max, v_r, w_r, gains, run.ts, edge),
         fit=fit,
         mean_square_growth=growth,
         floquet=of_drops,
@@ -207,7 +217,9 @@ def _burst_left(fit: ChannelFit, growth: float, v_r: Floats, w_r: Floats, run: R
     """By what factor the mean burst may grow at the fitted loss rate; None for a fit without bursts."""
     if fit.model != "gilbert_elliott" or growth >= 0.0 or fit.chain.loss_rate >= 1.0:
         return None
-    critical = mean_square.critical_burst(fit.chain.loss_rate, v_r, w_r, run.scenario.controller, run.ts)
+    critical = mean_square.critical_burst(
+        fit.chain.loss_rate, v_r, w_r, run.scenario.controller, run.ts, Edge.of(run.scenario)
+    )
     return critical / fit.mean_burst if np.isfinite(critical) else None
 
 
@@ -218,10 +230,15 @@ def _contractions(run: Run) -> tuple[float | None, float | None]:
     if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
         return None, None
     lost, reference, gains = run.lost[first:], run.reference[first:], run.scenario.controller
+    policy = run.scenario.error_detector.policy
     with np.errstate(all="ignore"):
-        of_drops = floquet.drop_sequence(lost, reference[:, 3], reference[:, 4], gains, run.ts)
-        of_motion = floquet.trajectory(run.pose[first:], reference, lost, gains, run.ts)
-    return _finite(float(np.exp(of_drops[0] / steps))), _finite(float(np.exp(of_motion[0] / steps)))
+        of_drops = floquet.drop_sequence(lost, reference[:, 3], reference[:, 4], gains, run.ts, Edge.of(run.scenario))
+        of_drops_per_step = _finite(float(np.exp(of_drops[0] / steps)))
+        if policy == "predict":  # whose answers depend on all commands since the pose, not on the pose alone
+            return of_drops_per_step, None
+        true = gains_at_true_speed(run.scenario)
+        of_motion = floquet.trajectory(run.pose[first:], reference, lost, true, run.ts, policy == "align")
+    return of_drops_per_step, _finite(float(np.exp(of_motion[0] / steps)))
 
 
 def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:

@@ -84,19 +84,17 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
     )
     yield (
         f"Pose always {analysis.n} steps old",
-        _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
+        "not computed: the edge predicts by a model with another speed than the AGV's"
+        if analysis.lifted_stable is None
+        else _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
     )
     yield f"Any outages up to {analysis.n} slots", _bursts(analysis)
     growth = math.exp(analysis.mean_square_growth)
     yield "Mean square", _verdict(growth < 1.0, f"E\\[e^2] times {growth:.6g} a step under the fitted channel")
-    if analysis.floquet is not None and analysis.contraction is not None:
-        yield (
-            "These very losses",
-            _verdict(
-                analysis.floquet < 1.0,
-                f"times {analysis.floquet:.6g} a step about the reference, {analysis.contraction:.6g} about the motion",
-            ),
-        )
+    if analysis.floquet is not None:
+        motion = "" if analysis.contraction is None else f", {analysis.contraction:.6g} about the motion"
+        told = f"times {analysis.floquet:.6g} a step about the reference{motion}"
+        yield "These very losses", _verdict(analysis.floquet < 1.0, told)
     colour = {"asymptotic": "green", "mean-square": "green", "bounded": "yellow", "unstable": "red"}
     verdict = analysis.verdict
     yield "Verdict", f"[bold {colour[verdict.word]}]{verdict.word}[/] (by {verdict.criterion})"

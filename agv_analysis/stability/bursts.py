@@ -22,11 +22,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from agv_analysis.run import Floats
-from agv_analysis.stability.linearisation import MARGINAL, burst_maps, is_constant, reachable, step_matrices
+from agv_analysis.stability.linearisation import (
+    HELD,
+    MARGINAL,
+    Edge,
+    burst_maps,
+    is_constant,
+    reachable,
+    seen,
+    step_matrices,
+)
 from agv_analysis.stability.products import log_spectral_radius
 from agv_cloud.parameters import ControllerParameters
 
@@ -52,23 +62,25 @@ class BurstVerdict:
     """P of the common norm x' P x behind `upper`, shape (m, m); m = 3 unless the AGV is parked throughout."""
 
 
-def verdict(n_max: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> BurstVerdict:
+def verdict(
+    n_max: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
+) -> BurstVerdict:
     """Verdict for arbitrary bursts up to `n_max` >= 0 on a lap with the speeds v_r [m/s], w_r [rad/s] of shape (N,)."""
-    F, G = _lap(v_r, w_r, gains, ts)
-    growth = list(_repeated_growths(F, G, n_max + 1))
+    lap = _lap(v_r, w_r, gains, ts, edge)
+    growth = list(_repeated_growths(lap, n_max + 1))
     worst = int(np.argmax(growth))
     lower = math.exp(growth[worst])
     if growth[worst] > MARGINAL:
         return BurstVerdict(n_max, UNSTABLE, lower, math.inf, worst, None)
-    certificate = _common_norm(_sample(F, G, np.abs(v_r), n_max + 1))
+    certificate = _common_norm(_sample(lap, np.abs(v_r), n_max + 1))
     if certificate is None:
         return BurstVerdict(n_max, UNDECIDED, lower, math.inf, worst, None)
-    upper = math.exp(_worst_growth(F, G, n_max + 1, certificate))
+    upper = math.exp(_worst_growth(lap, n_max + 1, certificate))
     return BurstVerdict(n_max, STABLE if upper < 1.0 else UNDECIDED, lower, upper, worst, certificate)
 
 
 def largest_n(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 1000
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 1000, edge: Edge = HELD
 ) -> tuple[int | None, int | None]:
     """(largest n_max that is proved stable, smallest n that is proved unstable) on a lap; arguments as of `verdict`.
 
@@ -76,13 +88,17 @@ def largest_n(
     both None: stable up to `limit`. They are neighbours unless what lies between them is undecided.
     """
     refuted = next(
-        (n for n, growth in enumerate(_repeated_growths(*_lap(v_r, w_r, gains, ts), limit + 1)) if growth > MARGINAL),
+        (
+            n
+            for n, growth in enumerate(_repeated_growths(_lap(v_r, w_r, gains, ts, edge), limit + 1))
+            if growth > MARGINAL
+        ),
         None,
     )
     proved, beyond = -1, limit + 1 if refuted is None else refuted
     attempt = beyond - 1  # just below what is refuted: nearly always proved at once
     while proved < beyond - 1:
-        if verdict(attempt, v_r, w_r, gains, ts).verdict == STABLE:
+        if verdict(attempt, v_r, w_r, gains, ts, edge).verdict == STABLE:
             proved = attempt
         else:
             beyond = attempt
@@ -109,38 +125,49 @@ def largest_n_across(v: float, gains: ControllerParameters, ts: float) -> int | 
     return max(-1, math.ceil(longest) - 2)
 
 
-def _lap(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> tuple[Floats, Floats]:
-    """F and G of the lap's steps, of what the AGV can reach alone; a single row where speeds are constant."""
+class _Lap(NamedTuple):
+    """The steps of a lap (see `linearisation`), of what the AGV can reach alone; one row where speeds are constant."""
+
+    F: Floats
+    G: Floats
+    H: Floats | None
+
+    def maps(self, longest: int) -> Iterator[Floats]:
+        """The maps of bursts of 1 .. `longest` steps."""
+        return burst_maps(self.F, self.G, longest, self.H)
+
+
+def _lap(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge) -> _Lap:
     if is_constant(v_r, w_r):
         v_r, w_r = v_r[:1], w_r[:1]
     size = reachable(v_r, w_r)
-    F, G = step_matrices(v_r, w_r, gains, ts)
-    return F[:, :size, :size], G[:, :size, :size]
+    F, G = (M[:, :size, :size] for M in step_matrices(v_r, w_r, gains, ts))
+    return _Lap(F, *seen(F, G, edge))
 
 
-def _repeated_growths(F: Floats, G: Floats, longest: int) -> Iterator[float]:
+def _repeated_growths(lap: _Lap, longest: int) -> Iterator[float]:
     """Growth (logarithm, per step) of the sequence that repeats bursts of L steps, for L = 1 .. longest.
 
     The last burst of a lap is cut short by its end.
     """
-    steps, shorter = len(F), [np.broadcast_to(np.eye(F.shape[-1]), F.shape)]
-    for length, M in enumerate(burst_maps(F, G, longest), start=1):
+    steps, shorter = len(lap.F), [np.broadcast_to(np.eye(lap.F.shape[-1]), lap.F.shape)]
+    for length, M in enumerate(lap.maps(longest), start=1):
         if steps == 1:
             yield log_spectral_radius(M) / length
             continue
         shorter.append(M)
         whole, rest = divmod(steps, length)
-        lap = M[: whole * length : length] if whole else M[:0]
+        factors = M[: whole * length : length] if whole else M[:0]
         if rest:
-            lap = np.concatenate((lap, shorter[rest][whole * length :][:1]))
-        yield log_spectral_radius(lap) / steps
+            factors = np.concatenate((factors, shorter[rest][whole * length :][:1]))
+        yield log_spectral_radius(factors) / steps
 
 
-def _sample(F: Floats, G: Floats, speed: Floats, longest: int) -> Floats:
+def _sample(lap: _Lap, speed: Floats, longest: int) -> Floats:
     """Maps of all burst lengths from a few dozen steps at which the AGV moves, shape (M, m, m)."""
-    moving = np.flatnonzero(speed > 0.05 * speed.max()) if len(F) > 1 else np.zeros(1, dtype=np.int64)
+    moving = np.flatnonzero(speed > 0.05 * speed.max()) if len(lap.F) > 1 else np.zeros(1, dtype=np.int64)
     moving = moving[:: max(1, len(moving) // 48)]
-    return np.concatenate([M[moving] for M in burst_maps(F, G, longest)])
+    return np.concatenate([M[moving] for M in lap.maps(longest)])
 
 
 def _common_norm(maps: Floats) -> Floats | None:
@@ -198,16 +225,16 @@ def _violation(maps: Floats, P: Floats) -> tuple[Floats, float] | None:
     return np.outer(y, y) - np.outer(x, x), float(values[worst, -1])
 
 
-def _worst_growth(F: Floats, G: Floats, longest: int, P: Floats) -> float:
+def _worst_growth(lap: _Lap, longest: int, P: Floats) -> float:
     """Upper bound on the growth (logarithm, per step) of sqrt(x' P x) for any sequence of bursts up to `longest` steps.
 
     With V(k) the largest growth from step k to the end of the lap, V(k) = max_L [log norm of M_L(k) + V(k + L)]. For
     any values W assumed beyond the end, max_k V(k) - W(k) bounds the growth of a lap (Collatz-Wielandt, max-plus).
     """
-    log_norms = np.stack([_log_norms(M, P) for M in burst_maps(F, G, longest)], axis=1)
-    if len(F) == 1:
+    log_norms = np.stack([_log_norms(M, P) for M in lap.maps(longest)], axis=1)
+    if len(lap.F) == 1:
         return float((log_norms[0] / np.arange(1, longest + 1)).max())
-    log_norms = np.tile(log_norms, (-(-longest // len(F)), 1))
+    log_norms = np.tile(log_norms, (-(-longest // len(lap.F)), 1))
     steps = len(log_norms)
     beyond = np.zeros(longest)
     for _ in range(2):

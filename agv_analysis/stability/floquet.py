@@ -5,7 +5,7 @@ criteria at frozen speeds are only indications. Growths are given as natural log
 shrinks errors by hundreds of powers of ten. The loop is stable if the largest one is below 0.
 
 - `constant_delay`: the pose is n steps old at every step (the lifted system of dimension 3 (n+1), never formed);
-- `drop_sequence`: the sequence of losses is given, one verdict a step; between receptions the sample is held;
+- `drop_sequence`: the sequence of losses is given, one verdict a step; between receptions it is held, or predicted;
 - `trajectory`: the same about the motion that was really driven, which may be far from the reference.
 
 Where the AGV does not move on the whole lap, only the errors that it can reach count (see `linearisation.reachable`).
@@ -22,11 +22,14 @@ from agv_analysis.run import Floats
 from agv_analysis.simulation.compiled import compiled
 from agv_analysis.stability.lifted import critical_delay_across, critical_delay_along, spectral_radius
 from agv_analysis.stability.linearisation import (
+    HELD,
     MARGINAL,
+    Edge,
     is_constant,
     loop_jacobians,
     reachable,
     reception_maps,
+    seen,
     step_matrices,
 )
 from agv_analysis.stability.products import growths
@@ -116,7 +119,9 @@ def _drive_lap(F: Floats, G: Floats, window: Floats) -> float:
     return log_scale
 
 
-def drop_sequence(lost: NDArray[np.bool_], v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> Floats:
+def drop_sequence(
+    lost: NDArray[np.bool_], v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
+) -> Floats:
     """Growths (logarithms) over the recorded steps of the three directions of the error, largest first, shape (m,).
 
     `lost` of shape (N,) says which updates were lost at the steps whose speeds are v_r [m/s], w_r [rad/s]; the sequence
@@ -127,18 +132,27 @@ def drop_sequence(lost: NDArray[np.bool_], v_r: Floats, w_r: Floats, gains: Cont
     if not len(received):
         return np.zeros(size)
     F, G = (M[:, :size, :size] for M in step_matrices(v_r, w_r, gains, ts))
-    return growths(reception_maps(F, G, received, received[0] + len(lost)))
+    G, H = seen(F, G, edge)
+    return growths(reception_maps(F, G, received, received[0] + len(lost), H))
 
 
 def trajectory(
-    pose: Floats, reference: Floats, lost: NDArray[np.bool_], gains: ControllerParameters, ts: float
+    pose: Floats,
+    reference: Floats,
+    lost: NDArray[np.bool_],
+    gains: ControllerParameters,
+    ts: float,
+    align: bool = False,
 ) -> Floats:
     """As `drop_sequence`, linearised about the motion that was driven instead of about the reference.
 
-    X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`. The growths are those of a displacement
+    X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`; the policy is `hold` or, with `align`,
+    that. The growths are those of a displacement
     of the whole run, in [m, m, rad] of the map.
     """
     age = np.arange(len(lost)) - np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
-    held = pose[np.arange(len(lost)) - age]
-    now, outdated = loop_jacobians(pose, held, reference, gains, ts)
+    taken = np.arange(len(lost)) - age
+    if align:
+        reference = np.hstack((reference[taken, :3], reference[:, 3:]))
+    now, outdated = loop_jacobians(pose, pose[taken], reference, gains, ts)
     return growths(reception_maps(now, outdated, np.flatnonzero(age == 0), len(lost)))

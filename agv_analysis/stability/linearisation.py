@@ -12,16 +12,25 @@ F and G hold the speeds of step k alone, so speeds may change inside a burst. Th
 zero error is an equilibrium: X_r(k-n) compared with X_c(k-n). The paper compares X_r(k) with X_c(k-n), so its loop
 settles n steps ahead of the reference; about that motion the equation is the same while speeds are constant, and off by
 the change of speeds over n steps otherwise.
+
+Staleness policies differ in what the edge takes for the error, h(k). A fresh pose makes it h(k) = e(k); from then on
+
+    e(k+1) = F(k) e(k) + G(k) h(k),    h(k+1) = H(k) h(k),    H = I for hold and align, F + G for predict
+
+so a prediction goes on as the loop would without outages. A true speed of 1 + delta times the commanded one scales the
+column of K_x in G, but not in the H of a predictor, whose model does not know of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
@@ -41,6 +50,38 @@ def step_matrices(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: flo
     return np.moveaxis(F, 2, 0).copy(), np.moveaxis(G, 2, 0).copy()
 
 
+class Edge(NamedTuple):
+    """What the criteria must know of a staleness policy, and of the plant behind it."""
+
+    predicts: bool = False
+    """Is an outdated pose moved on by the plant's model (`predict`), or taken as it is (`hold`, `align`)?"""
+    delta: float = 0.0
+    """Error of the true speed: it is 1 + delta times the commanded one."""
+
+    @property
+    def is_exact(self) -> bool:
+        """Does the edge know the error as well as if no pose were lost?"""
+        return self.predicts and self.delta == 0.0
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Edge:
+        """That of a scenario's nodes. To first order a predictor that integrates otherwise than the plant is exact."""
+        return cls(scenario.error_detector.policy == "predict", scenario.plant.speed_scale - 1.0)
+
+
+HELD = Edge()
+"""The paper's: the outdated pose as it is, and an AGV that drives what it is told."""
+
+
+def seen(F: Floats, G: Floats, edge: Edge) -> tuple[Floats, Floats | None]:
+    """G with the plant's true speed, and H of the policy, None for the identity; F and G of shape (..., m, m)."""
+    model = F + G if edge.predicts else None
+    if edge.delta != 0.0:
+        G = G.copy()
+        G[..., 0] *= 1.0 + edge.delta
+    return G, model
+
+
 def reachable(v_r: Floats, w_r: Floats) -> int:
     """How many of (x_e, y_e, theta_e) the commands can move on a track with these speeds: all 3 if it moves at all.
 
@@ -56,33 +97,42 @@ def is_constant(v_r: Floats, w_r: Floats) -> bool:
     return bool(np.ptp(v_r) == 0.0 and np.ptp(w_r) == 0.0)
 
 
-def burst_maps(F: Floats, G: Floats, longest: int) -> Iterator[Floats]:
+def burst_maps(F: Floats, G: Floats, longest: int, H: Floats | None = None) -> Iterator[Floats]:
     """Maps of the error from one reception to the next, L = 1 .. longest steps later, each of the shape of F.
 
     Row k of the L-th is M_L(k): e(k + L) = M_L(k) e(k) if step k was received and the next L - 1 steps were lost:
-    M_0 = I, M_{i+1}(k) = F(k+i) M_i(k) + G(k+i); at constant speeds M_L = F^L + sum_{i<L} F^i G. Rows of F and G, shape
-    (N, m, m), are the steps of a lap that is driven again and again.
+    M_0 = I, M_{i+1}(k) = F(k+i) M_i(k) + G(k+i); at constant speeds M_L = F^L + sum_{i<L} F^i G. Rows of F and G,
+    shape (N, m, m), are the steps of a lap that is driven again and again. With the H of a predictor, of the same
+    shape, G(k+i) acts on H(k+i-1) ... H(k) instead of on the error as it was received.
     """
     steps = len(F)
-    M = np.broadcast_to(np.eye(F.shape[-1]), F.shape)
+    M = at_edge = np.broadcast_to(np.eye(F.shape[-1]), F.shape)
     for i in range(longest):
         now = (np.arange(steps) + i) % steps
-        M = F[now] @ M + G[now]
+        if H is None:
+            M = F[now] @ M + G[now]
+        else:
+            M, at_edge = F[now] @ M + G[now] @ at_edge, H[now] @ at_edge
         yield M
 
 
-def reception_maps(F: Floats, G: Floats, received: NDArray[np.int64], end: int) -> Floats:
+def reception_maps(F: Floats, G: Floats, received: NDArray[np.int64], end: int, H: Floats | None = None) -> Floats:
     """Maps of the error from each reception to the next, and from the last to step `end`; shape (receptions, m, m).
 
     `received` holds the steps of the receptions, increasing; steps beyond the rows of F and G, shape (N, m, m), are
-    those of further laps.
+    those of further laps. H as of `burst_maps`.
     """
     lengths = np.diff(np.append(received, end))
     maps = np.broadcast_to(np.eye(F.shape[-1]), (len(received), *F.shape[1:])).copy()
+    at_edge = maps.copy()
     for i in range(int(lengths.max())):
         going = np.flatnonzero(lengths > i)
         now = (received[going] + i) % len(F)
-        maps[going] = F[now] @ maps[going] + G[now]
+        if H is None:
+            maps[going] = F[now] @ maps[going] + G[now]
+        else:
+            maps[going] = F[now] @ maps[going] + G[now] @ at_edge[going]
+            at_edge[going] = H[now] @ at_edge[going]
     return np.asarray(maps)
 
 

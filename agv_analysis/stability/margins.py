@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,10 +13,17 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import almost_sure, bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.chain import chain_of
+from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference import Reference, lap_steps
 
 ALONG, ACROSS = "along", "across"
+
+LONGEST, LONGEST_PREDICTED = 1000, 200
+"""Longest bursts [slots] that are tried; fewer behind a predictor, where nothing ends the search early."""
+
+LONGEST_DELAY = 10_000
+"""Longest constant delay [steps] that is tried."""
 
 
 @dataclass(frozen=True)
@@ -116,26 +124,31 @@ def margins(scenario: Scenario) -> Margins:
         reasons["n_max.paper"] = (
             "no bound: the test holds for every n, since it sees an outdated pose only by how far it has turned"
         )
-    n_lifted = floquet.largest_constant_delay(v_r, w_r, gains, ts)
-    if n_lifted is None:
-        reasons["n_max.lifted"] = "no bound: the lap contracts for every n that was tried, up to 10000"
-    n_bursts, refuted = bursts.largest_n(v_r, w_r, gains, ts)
+    edge, true = Edge.of(scenario), gains_at_true_speed(scenario)
+    n_lifted = _largest_constant_delay(v_r, w_r, true, ts, edge, reasons)
+    longest = LONGEST_PREDICTED if edge.predicts else LONGEST
+    n_bursts, refuted = bursts.largest_n(v_r, w_r, gains, ts, longest, edge)
     if n_bursts is None:
-        reasons["n_max.bursts"] = "no bound: every burst that was tried contracts, up to 1000 slots"
+        reasons["n_max.bursts"] = f"no bound: every burst that was tried contracts, up to {longest} slots"
     elif refuted is not None and refuted > n_bursts + 1:
         reasons["n_max.bursts"] = f"proved up to {n_bursts}, refuted from {refuted} on, between them undecided"
-    p_mean_square = _none_below_zero(mean_square.critical_loss(v_r, w_r, gains, ts), "p_max.mean_square", reasons)
-    p_almost_sure = almost_sure.critical_loss(v_r, w_r, gains, ts)
+    p_mean_square = _none_below_zero(mean_square.critical_loss(v_r, w_r, gains, ts, edge), "p_max.mean_square", reasons)
+    if p_mean_square is not None and p_mean_square > mean_square.MOST_LOST:
+        p_mean_square = None
+        reasons["p_max.mean_square"] = (
+            f"no bound: the mean square dies out at every loss probability up to {mean_square.MOST_LOST}"
+        )
+    p_almost_sure = almost_sure.critical_loss(v_r, w_r, gains, ts, edge=edge)
     if p_almost_sure is not None:
         p_almost_sure = _none_below_zero(p_almost_sure, "p_max.almost_sure", reasons)
     else:
         reasons["p_max.almost_sure"] = "no bound: almost every run converges at every loss probability up to 0.999"
-    if almost_sure.is_degenerate(ts * gains.kx) and not np.any(w_r):
+    if almost_sure.is_degenerate(ts * gains.kx) and not np.any(w_r) and edge == HELD:
         reasons.setdefault(
             "p_max.almost_sure",
             "1 / (T_s K_x) is an integer: on a straight track some burst brings the error along it to 0 at one stroke",
         )
-    loss_rate, burst = _burst(scenario, v_r, w_r, reasons)
+    loss_rate, burst = _burst(scenario, v_r, w_r, edge, reasons)
     return Margins(
         n_paper=n_paper,
         n_lifted=n_lifted,
@@ -144,10 +157,39 @@ def margins(scenario: Scenario) -> Margins:
         p_almost_sure=p_almost_sure,
         loss_rate=loss_rate,
         burst_mean_square=burst,
-        delay=_delay(float(np.abs(v_r).max()), gains, ts),
-        binding=binding(float(np.abs(v_r).max()), gains, ts),
+        delay=None if edge.predicts else _delay(float(np.abs(v_r).max()), true, ts),
+        binding=_binding_of(edge, n_bursts, float(np.abs(v_r).max()), true, ts),
         reasons=reasons,
     )
+
+
+def gains_at_true_speed(scenario: Scenario) -> ControllerParameters:
+    """The gains as the plant feels them: K_x times true over commanded speed."""
+    return dataclasses.replace(scenario.controller, kx=scenario.controller.kx * scenario.plant.speed_scale)
+
+
+def _largest_constant_delay(
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge, reasons: dict[str, str]
+) -> int | None:
+    name = "n_max.lifted"
+    if edge.predicts and not edge.is_exact:
+        reasons[name] = "no answer: a constant delay behind a predictor with a wrong model is not computed"
+        return None
+    found = floquet.largest_constant_delay(v_r, w_r, gains, ts, 0 if edge.is_exact else LONGEST_DELAY)
+    if found is None:
+        reasons[name] = (
+            "no bound: an exact prediction is as good as a fresh pose"
+            if edge.is_exact
+            else f"no bound: the lap contracts for every n that was tried, up to {LONGEST_DELAY}"
+        )
+    return found
+
+
+def _binding_of(edge: Edge, n_bursts: int | None, v: float, gains: ControllerParameters, ts: float) -> str | None:
+    """As `binding`; behind a predictor the error along the track, since the model is wrong in that speed alone."""
+    if edge.predicts:
+        return None if n_bursts is None else ALONG
+    return binding(v, gains, ts)
 
 
 def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
@@ -175,7 +217,9 @@ def _lap(scenario: Scenario) -> int:
     return max(1, steps)
 
 
-def _burst(scenario: Scenario, v_r: Floats, w_r: Floats, reasons: dict[str, str]) -> tuple[float | None, float | None]:
+def _burst(
+    scenario: Scenario, v_r: Floats, w_r: Floats, edge: Edge, reasons: dict[str, str]
+) -> tuple[float | None, float | None]:
     """Loss rate of the scenario's uplink, and the critical mean burst at it."""
     chain = chain_of(scenario.relay.uplink)
     loss_rate = None if chain is None else chain.loss_rate
@@ -186,7 +230,7 @@ def _burst(scenario: Scenario, v_r: Floats, w_r: Floats, reasons: dict[str, str]
     if not 0.0 < loss_rate < 1.0:
         reasons[name] = f"no answer: the scenario's uplink loses {'nothing' if loss_rate == 0.0 else 'everything'}"
         return loss_rate, None
-    found = mean_square.critical_burst(loss_rate, v_r, w_r, scenario.controller, scenario.plant.ts)
+    found = mean_square.critical_burst(loss_rate, v_r, w_r, scenario.controller, scenario.plant.ts, edge)
     if math.isinf(found):
         reasons[name] = "no bound: bursts of a million slots on average are not too long"
         return loss_rate, None

@@ -1,7 +1,8 @@
 """Mean square: does E[|e|^2] die out under random losses?
 
-With the held sample h the loop is a Markov jump linear system: xi = (e, h) goes to ((F+G) e, e) at a reception and to
-(F e + G h, h) at a loss. With X_i = E[xi xi'; channel in state i] the second moments obey the linear recursion
+With what the edge takes for the error, h, the loop is a Markov jump linear system: xi = (e, h) goes to ((F+G) e, H e)
+at a reception and to (F e + G h, H h) at a loss, with H = I where the sample is held (see `linearisation`). With
+X_i = E[xi xi'; channel in state i] the second moments obey the linear recursion
 
     X_j(k+1) = sum_i T_ij [ g_i A_1(k) X_i(k) A_1(k)' + (1 - g_i) A_0(k) X_i(k) A_0(k)' ]
 
@@ -15,6 +16,7 @@ length B at a loss rate pi: pi B < 1/a - 1/2.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -23,17 +25,20 @@ import numpy as np
 from agv_analysis.run import Floats
 from agv_analysis.simulation.compiled import compiled
 from agv_analysis.stability.chain import Chain, bernoulli, bursty, shortest_mean_burst
-from agv_analysis.stability.linearisation import MARGINAL, is_constant, reachable, step_matrices
+from agv_analysis.stability.linearisation import HELD, MARGINAL, Edge, is_constant, reachable, seen, step_matrices
 from agv_cloud.parameters import ControllerParameters
 
 _LAPS = 40
 
+MOST_LOST = 0.9999
+"""Largest loss probability that is asked for behind a predictor, which may make any of them harmless."""
 
-def operator(F: Floats, G: Floats, chain: Chain) -> Floats:
+
+def operator(F: Floats, G: Floats, chain: Chain, H: Floats | None = None) -> Floats:
     """Matrix of the recursion at one step's F and G, shape (m, m) each: shape (s, s), s = states * (2 m)^2."""
-    size, zero, one = len(F), np.zeros_like(F), np.eye(len(F))
-    received = np.block([[F + G, zero], [one, zero]])
-    missed = np.block([[F, G], [zero, one]])
+    size, zero, H = len(F), np.zeros_like(F), np.eye(len(F)) if H is None else H
+    received = np.block([[F + G, zero], [H, zero]])
+    missed = np.block([[F, G], [zero, H]])
     rows = [
         np.kron(T_i[:, None], g * np.kron(received, received) + (1.0 - g) * np.kron(missed, missed))
         for T_i, g in zip(chain.transition, chain.delivery, strict=True)
@@ -41,9 +46,9 @@ def operator(F: Floats, G: Floats, chain: Chain) -> Floats:
     return np.hstack(rows).reshape(len(rows) * 4 * size * size, -1)
 
 
-def spectral_radius(F: Floats, G: Floats, chain: Chain) -> float:
+def spectral_radius(F: Floats, G: Floats, chain: Chain, H: Floats | None = None) -> float:
     """Growth of the second moments per step at speeds that do not change; arguments as of `operator`."""
-    return float(np.abs(np.linalg.eigvals(operator(F, G, chain))).max())
+    return float(np.abs(np.linalg.eigvals(operator(F, G, chain, H))).max())
 
 
 def along_spectral_radius(a: float, chain: Chain) -> float:
@@ -52,25 +57,34 @@ def along_spectral_radius(a: float, chain: Chain) -> float:
 
 
 def lap_growth(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, chain: Chain, moments: Floats | None = None
-) -> float:
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, chain: Chain, moments: Floats | None = None,
+    edge: Edge = HELD,
+) -> float:  # fmt: skip
     """Growth (logarithm) of the second moments over a lap with the speeds v_r [m/s], w_r [rad/s] of shape (N,).
 
     By driving laps until the growth settles; `moments`, shape (3, states, m, m), are those to begin with, and are left
     as they settled, which makes the next call with a similar chain faster.
     """
     size = reachable(v_r, w_r)
+    if edge.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
+        chain, moments, edge = bernoulli(0.0), None, HELD
     F, G = (np.ascontiguousarray(M[:, :size, :size]) for M in step_matrices(v_r, w_r, gains, ts))
+    G, H = seen(F, G, edge)
     if is_constant(v_r, w_r) and len(chain.delivery) <= 8:
-        return len(v_r) * math.log(spectral_radius(F[0], G[0], chain))
+        return len(v_r) * math.log(spectral_radius(F[0], G[0], chain, None if H is None else H[0]))
+    if H is None:
+        H = F[:0]
     if moments is None:
         moments = unit_moments(len(chain.delivery))
     moments = moments[:, :, :size, :size]
     growth = math.nan
     for _ in range(_LAPS):
-        log_scale = compiled(_drive_lap)(F, G, chain.transition, chain.delivery, moments)
+        log_scale = compiled(_drive_lap)(F, G, H, chain.transition, chain.delivery, moments)
         # From one lap to the next the moments keep their proportions in the end, so their size says it all.
         size_now = float(np.trace(moments[0] + moments[2], axis1=1, axis2=2).sum())
+        if not size_now > 0.0:  # a predictor leaves nothing of the error but rounding
+            moments[:] = np.eye(size)
+            return -math.inf
         moments /= size_now
         before, growth = growth, log_scale + math.log(size_now)
         if abs(growth - before) <= 1e-8 * max(1.0, abs(growth)):
@@ -83,10 +97,10 @@ def unit_moments(states: int) -> Floats:
     return np.array(np.broadcast_to(np.eye(3), (3, states, 3, 3)))
 
 
-def _drive_lap(F: Floats, G: Floats, T: Floats, g: Floats, moments: Floats) -> float:
+def _drive_lap(F: Floats, G: Floats, H: Floats, T: Floats, g: Floats, moments: Floats) -> float:
     """Send the moments E[e e'], E[e h'], E[h h'] by channel state, shape (3, states, m, m), through a lap; in place.
 
-    What is left in them is to be multiplied by exp(return value).
+    H has no row where it is the identity. What is left in them is to be multiplied by exp(return value).
     """
     states, size = moments.shape[1], moments.shape[2]
     log_scale = 0.0
@@ -107,6 +121,12 @@ def _drive_lap(F: Floats, G: Floats, T: Floats, g: Floats, moments: Floats) -> f
             _multiply(upper, F[k], True, missed[0, i], False)
             _multiply(missed[1, i], G[k], True, missed[0, i], True)
             missed[2, i] = hh
+            if len(H):
+                for which in (received, missed):
+                    _multiply(which[1, i], H[k], True, upper, False)
+                    which[1, i] = upper
+                    _multiply(which[2, i], H[k], True, upper, False)
+                    _multiply(H[k], upper, False, which[2, i], False)
         largest = 0.0
         for j in range(states):
             _mix(T[:, j], g, received, missed, moments[:, j])
@@ -145,17 +165,30 @@ def _multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool
             product[i, j] = value
 
 
-def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
-    """Loss probability p* below which independent losses leave a lap mean-square stable; -1: unstable without any."""
+def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD) -> float:
+    """Loss probability p* below which independent losses leave a lap mean-square stable; -1: unstable without any.
+
+    Behind a predictor 1 if they do at every p up to MOST_LOST.
+    """
     moments = unit_moments(1)
 
     def growth(p: float) -> float:
-        return lap_growth(v_r, w_r, gains, ts, bernoulli(p), moments) - MARGINAL * len(v_r)
+        return lap_growth(v_r, w_r, gains, ts, bernoulli(p), moments, edge) - MARGINAL * len(v_r)
 
-    return crossing(growth, 0.0, 1.0) if growth(0.0) < 0.0 else -1.0
+    if growth(0.0) >= 0.0:
+        return -1.0
+    if not edge.predicts:
+        return crossing(growth, 0.0, 1.0)
+    tried = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, MOST_LOST)
+    for low, high in itertools.pairwise(tried):
+        if growth(high) >= 0.0:
+            return crossing(growth, low, high)
+    return 1.0
 
 
-def critical_burst(loss_rate: float, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
+def critical_burst(
+    loss_rate: float, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
+) -> float:
     """Mean burst B* [steps] below which a Gilbert channel of this loss rate in (0, 1) leaves a lap mean-square stable.
 
     -1 if the shortest bursts possible are too long, inf if 1e6 steps are not.
@@ -163,7 +196,7 @@ def critical_burst(loss_rate: float, v_r: Floats, w_r: Floats, gains: Controller
     moments = unit_moments(2)
 
     def growth(burst: float) -> float:
-        return lap_growth(v_r, w_r, gains, ts, bursty(loss_rate, burst), moments) - MARGINAL * len(v_r)
+        return lap_growth(v_r, w_r, gains, ts, bursty(loss_rate, burst), moments, edge) - MARGINAL * len(v_r)
 
     low, high = 0.0, shortest_mean_burst(loss_rate)
     while growth(high) < 0.0:
