@@ -7,6 +7,10 @@ The criteria are asked from the strongest statement to the weakest:
   survived;
 - `bounded`: neither, but the speed is limited, which makes a bounded limit cycle of what would otherwise grow;
 - `unstable`: neither, and nothing bounds the error.
+
+The Floquet multiplier of the run's own sequence of losses stands beside the verdict and does not enter it: it says what
+those losses did to a small error in that one run. Where the mean square grows, most runs may still contract; and a run
+that is short, or ends inside an outage, may have a multiplier above 1 in a loop that contracts under any such outages.
 """
 
 from __future__ import annotations
