@@ -128,3 +128,10 @@ def test_a_trace_has_no_best_gain_and_says_why(agv_ncs: Callable[..., tuple[int,
     assert "trace" in found["best_kx_reason"]
     assert "closed form" in found["burst_max"]["mean_square_reason"]
     assert found["n_max"]["bursts"] == 14
+
+
+def test_best_gains_are_those_of_a_held_pose(agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    settings = ("error_detector.track=line", "error_detector.policy=predict")
+    status, said = agv_ncs("stability", "config/paper.yaml", *(word for s in settings for word in ("--set", s)))
+    assert status == 0, said
+    assert "Best K_x: no answer: computed for a pose that is held" in " ".join(said.split())

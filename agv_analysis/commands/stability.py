@@ -79,12 +79,14 @@ def command(
 def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
     """Best K_x by objective under the scenario's uplink, and what is to be said of them, by objective.
 
-    No gains for a channel that is no Markov chain or loses all; the reason is that of `best_kx`.
+    None behind a predictor, for a channel that is no Markov chain or loses all; the reason is that of `best_kx`.
     """
     from agv_analysis.stability.chain import chain_of
     from agv_analysis.stability.gains import WHY_A_TOLERANCE, best_kx
 
     chain, model = chain_of(scenario.relay.uplink), scenario.relay.uplink.model
+    if scenario.error_detector.policy == "predict":
+        return {}, {"best_kx": "no answer: computed for a pose that is held, not for one that is predicted"}
     if chain is None:
         return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
     if chain.loss_rate >= 1.0:
