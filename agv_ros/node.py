@@ -41,6 +41,9 @@ _POLL_PERIOD = 0.01
 PUBLISHED = "published "
 """Key, before the topic's name, under which a node's diagnostics say how many messages it has published there."""
 
+CHANGED = "changed "
+"""Key, before a parameter's name, under which a node's diagnostics say how it was changed last while the node ran."""
+
 ENDED = "ended"
 """Key in a node's last diagnostics: what it says there of its messages is final."""
 
@@ -87,6 +90,7 @@ class LoopNode(Node, Generic[P]):
         self._steps_per_report = max(1, round(1.0 / self.settings.ts))
         self._last_ns = self.grid.start_ns
         self._ended = False
+        self._changes: dict[str, str] = {}
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -188,8 +192,9 @@ class LoopNode(Node, Generic[P]):
 
         Called before a step's answer is published, so that no other node's report of the step can come before it.
         """
+        k = self.grid.step(stamp_ns)
         self._last_ns = max(self._last_ns, stamp_ns)
-        if self.grid.step(stamp_ns) % self._steps_per_report == 0:
+        if k % self._steps_per_report == 0:
             self.report(stamp_ns)
 
     def report(self, stamp_ns: int) -> None:
@@ -198,6 +203,7 @@ class LoopNode(Node, Generic[P]):
         published = {output.topic: output.count for output in self.outputs}
         published[self._diagnostics.topic] += 1  # this report
         facts = self.facts() | {f"{PUBLISHED}{topic}": str(count) for topic, count in published.items()}
+        facts |= self._changes
         facts |= {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
         if self._ended:
             facts |= {ENDED: "true"}
@@ -217,9 +223,20 @@ class LoopNode(Node, Generic[P]):
             settings = build(type(self.settings), as_dict(self.settings) | changed, self.get_name())
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        before = as_dict(self.settings)
         self.settings = settings
         self.on_settings()
+        self._say_changed(before)
         return SetParametersResult(successful=True)
+
+    def _say_changed(self, before: dict[str, Any]) -> None:
+        """Report what has another value than `before`, so that a recording says from which step on it holds."""
+        after, k = as_dict(self.settings), self.grid.step(self._last_ns)
+        changed = {name: value for name, value in after.items() if value != before[name]}
+        for name, value in changed.items():
+            self._changes[f"{CHANGED}{name}"] = f"{before[name]} -> {value} after step {k}"
+        if changed:
+            self.report(self._last_ns)
 
 
 def _declare(node: Node, schema: type[P]) -> P:

@@ -49,3 +49,42 @@ def test_nodes_lose_on_a_correlated_downlink_what_the_simulation_loses(drive: Dr
         assert said[f"{link} lost"] == str(lost.sum())
         assert said[f"{link} loss rate"] == f"{lost.mean():.6f}"
         assert said[f"{link} longest outage"] == str(max(outages))
+
+
+def test_a_parameter_changed_at_run_time_is_in_the_diagnostics() -> None:
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.parameter import Parameter
+
+    from agv_plant.relay_node import RelayNode
+    from agv_ros.executor import spin_for
+    from agv_ros.node import LOOP_QOS
+
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = SingleThreadedExecutor(context=context)
+    relay = RelayNode(context=context, use_global_arguments=False)
+    probe = Node("probe", context=context, use_global_arguments=False)
+    heard: list[DiagnosticArray] = []
+    probe.create_subscription(DiagnosticArray, "/diagnostics", heard.append, LOOP_QOS)
+    for node in (relay, probe):
+        executor.add_node(node)
+    try:
+        assert spin_for(executor, lambda: probe.count_publishers("/diagnostics") == 1, 60.0)
+        assert spin_for(executor, lambda: relay.count_subscribers("/diagnostics") == 1, 60.0)
+        (result,) = relay.set_parameters([Parameter("uplink.p", value=0.25)])
+        assert result.successful
+        assert spin_for(executor, lambda: bool(heard), 60.0)
+        said = {value.key: value.value for value in heard[-1].status[0].values}
+        assert said["changed uplink.p"] == "0.0 -> 0.25 after step 0"
+        relay.set_parameters([Parameter("uplink.p", value=0.25)])
+        assert not relay.set_parameters([Parameter("uplink.p", value=2.0)])[0].successful
+        assert [key for key in said if key.startswith("changed ")] == ["changed uplink.p"]
+    finally:
+        executor.shutdown()
+        for node in (relay, probe):
+            node.destroy_node()
+        context.try_shutdown()
