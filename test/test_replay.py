@@ -293,7 +293,10 @@ def test_ros2_bag_play_into_nodes_on_simulated_time(start: Start) -> None:
 
     params = Path(__file__).parents[1] / "config/outages.yaml"
     for name in ("controller", "error_detector"):
-        start(f"agv_cloud.{name}_node", "--ros-args", "--params-file", str(params), "-p", "use_sim_time:=true")
+        start(
+            f"agv_cloud.{name}_node", "--ros-args", "--params-file", str(params), "-p", "use_sim_time:=true",
+            "-p", "wait_for_subscribers:=1",  # else the error detector may answer before the controller hears it
+        )  # fmt: skip
     bag = read_bag(SAMPLE)
     recorded = yaml.safe_load(bag.topics["/edge/slot"].offered_qos)[0]
     qos = QoSProfile(depth=recorded["depth"] or 10, reliability=ReliabilityPolicy[recorded["reliability"].upper()])
