@@ -274,7 +274,7 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     for node in nodes.values():
         node.tell(signal.SIGINT)
     for node in nodes.values():
-        node.stop(signal.SIGINT)
+        node.collect()
     if recorder is not None:
         recorder.stop(signal.SIGINT)
         nodes["recorder"] = recorder
@@ -343,8 +343,12 @@ class _Process:
             self._process.send_signal(number)
 
     def stop(self, number: signal.Signals) -> None:
-        """End it, if need be by force, and collect the rest of what it said."""
+        """Tell it to end, and see to it."""
         self.tell(number)
+        self.collect()
+
+    def collect(self) -> None:
+        """Wait for its end, which comes by force if it takes too long, and for the rest of what it said."""
         if self.is_running(_STOP_TIMEOUT):
             self._process.kill()
         self._process.wait()
