@@ -32,6 +32,14 @@ def payloads(bag: Path) -> dict[str, list[tuple[int, bytes]]]:
     return found
 
 
+def changed_topics(first: Path, second: Path) -> dict[str, tuple[int, int]]:
+    """Topics whose messages are not the same in both bags, with the numbers of messages; short, for a failed test."""
+    before, after = payloads(first), payloads(second)
+    topics = before.keys() | after.keys()
+    lists = {topic: (before.get(topic, []), after.get(topic, [])) for topic in topics}
+    return {topic: (len(old), len(new)) for topic, (old, new) in lists.items() if old != new}
+
+
 # v(0), settling to 1 cm, damping: the canonical scenario's published behaviour, worked out independently of this code.
 @pytest.mark.parametrize(
     ("kx", "v_max", "settled", "damping"),
@@ -141,9 +149,9 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(drive: Drive, tmp_path: 
     drive(*outages, bag=second)
     drive(*outages, "relay.seed=2", bag=other)
     assert len(payloads(first)) == TOPICS
-    assert payloads(first) == payloads(second)
-    changed = {topic for topic, messages in payloads(other).items() if messages != payloads(first)[topic]}
-    assert {"/edge/slot", "/edge/pose", "/edge/error", "/edge/cmd_vel", "/agv/pose"} <= changed
+    assert not changed_topics(first, second)
+    changed = changed_topics(first, other)
+    assert {"/edge/slot", "/edge/pose", "/edge/error", "/edge/cmd_vel", "/agv/pose"} <= changed.keys()
 
 
 def test_processes_give_the_same_bytes_as_one_process(drive: Drive, tmp_path: Path) -> None:
@@ -154,7 +162,7 @@ def test_processes_give_the_same_bytes_as_one_process(drive: Drive, tmp_path: Pa
     scenario = load_scenario(str(REPOSITORY / "config/outages.yaml"), settings)
     outcome = run_in_processes(scenario, tmp_path / "several", lambda _: None)
     assert (outcome.steps, outcome.failure, outcome.recording_failure) == (600, "", "")
-    assert payloads(tmp_path / "one") == payloads(tmp_path / "several")
+    assert not changed_topics(tmp_path / "one", tmp_path / "several")
 
 
 def test_the_downlink_loses_commands_and_the_plant_holds_the_last(drive: Drive) -> None:
