@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.simulation.batch import cores
-from agv_analysis.simulation.compiled import compiled
 from agv_analysis.simulation.loop import Case, at_rest, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.reference import Reference

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agv_analysis.compiled import compiled
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.simulation.compiled import compiled
 from agv_analysis.simulation.loop import Case, at_rest, history, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 
@@ -87,7 +87,7 @@ CALL = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import outer
-from agv_analysis.simulation.compiled import compiled
+from agv_analysis.compiled import compiled
 print(compiled(outer.outer)(2.0))
 """
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Bytes, Ints
 from agv_analysis.bags.layout import LEAD, Layout
+from agv_analysis.compiled import HAS_NUMBA, compiled
 
 MAX_LAYOUTS = 32
 """Each message is compared with so many layouts at most."""
@@ -111,6 +112,4 @@ def place(
 
 def compiled_place() -> Callable[..., Any] | None:
     """`place`, compiled; None where numba is not installed."""
-    from agv_analysis.simulation.compiled import HAS_NUMBA, compiled
-
     return compiled(place) if HAS_NUMBA else None

@@ -11,10 +11,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import TWIN_OFFSET
-from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Loop, Rows, Settings, answer, at_rest, goes_on, obey, received
 from agv_analysis.simulation.single import settings_of, steps_of
 from agv_cloud.reference import Reference

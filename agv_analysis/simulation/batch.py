@@ -13,9 +13,9 @@ from typing import get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Case, Statistics, at_rest, statistics, statistics_of_twins, statistics_of_two
 from agv_analysis.simulation.single import reference_of, settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air

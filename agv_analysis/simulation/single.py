@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.compiled import compiled, numbers
 from agv_analysis.simulation.loop import Case, Settings, at_rest, history
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference

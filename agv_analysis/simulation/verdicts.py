@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.simulation.compiled import compiled, numbers
+from agv_analysis.compiled import compiled, numbers
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.installed import TRACE, find_model
 from agv_plant.parameters import ChannelParameters

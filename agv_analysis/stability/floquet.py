@@ -18,8 +18,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
-from agv_analysis.simulation.compiled import compiled
 from agv_analysis.stability.lifted import critical_delay_across, critical_delay_along, spectral_radius
 from agv_analysis.stability.linearisation import (
     HELD,

@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
+from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
-from agv_analysis.simulation.compiled import compiled
 
 
 def ordered_product(factors: Floats) -> tuple[Floats, float]:

@@ -1,4 +1,4 @@
-"""The nodes' functions, compiled.
+"""Plain functions, compiled: those of the nodes, and the loops over a bag's messages.
 
 Theory of operation. numba compiles a function that calls other functions only if these are compiled as well, but the
 nodes' functions are plain ones and stay so. `compiled` therefore follows the calls: it makes a copy of the function in
