@@ -27,7 +27,8 @@ class ControllerNode(LoopNode[ControllerParameters]):
         error, gains = decode_error(data), self.settings
         self.report_every_second(error.stamp_ns)
         v, w = control_law(error.x_e, error.y_e, error.theta_e, error.v_r, error.w_r, gains.kx, gains.ky, gains.ktheta)
-        self._cmd_vel.publish(encode_command(Command(error.stamp_ns, limit_speed(v, gains.v_max), w)))
+        command = Command(error.stamp_ns, limit_speed(v, gains.v_max), w)
+        self._cmd_vel.publish(encode_command(command, gains.frame_prefix))
 
 
 def main(args: Sequence[str] | None = None) -> None:

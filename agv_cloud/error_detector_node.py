@@ -22,8 +22,10 @@ from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
 from agv_ros.stamps import Steps
+from agv_ros.transforms import TransformBroadcaster
 from agv_ros.wire import (
     FRAME_MAP,
+    FRAME_REFERENCE,
     InvalidMessageError,
     Pose,
     TrackingError,
@@ -49,6 +51,9 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._ready: deque[Joined[Pose]] = deque()
         self._answered = -1
         self._error_out = self.output(Odometry, "edge/error")
+        self._transforms = TransformBroadcaster(self, FRAME_REFERENCE)
+        if not self._transforms.available:  # said here only: there is no loop without this node
+            self.get_logger().info("tf2_msgs is not installed: no node of this loop publishes transforms on /tf")
         self.input(PoseStamped, "edge/pose", self._on_pose, self._error_out)
         self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
         self._publish_path()
@@ -117,7 +122,9 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             held = self._prediction.at(k, taken, held)
         eps = tracking_error(target.x, target.y, target.theta, *held)
         self._answered = k
-        self._error_out.publish(encode_error(TrackingError(stamp_ns, *eps, now.v, now.w)))
+        error = TrackingError(stamp_ns, *eps, now.v, now.w)
+        self._transforms.send(Pose(stamp_ns, now.x, now.y, now.theta))
+        self._error_out.publish(encode_error(error, self.settings.frame_prefix))
 
     def facts(self) -> dict[str, str]:
         """Slots that were not answered, by reason."""

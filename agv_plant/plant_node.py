@@ -27,7 +27,9 @@ from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
 from agv_ros.stamps import to_nanoseconds
+from agv_ros.transforms import TransformBroadcaster
 from agv_ros.wire import (
+    FRAME_AGV,
     Command,
     InvalidMessageError,
     Pose,
@@ -75,6 +77,7 @@ class PlantNode(LoopNode[PlantParameters]):
         self._lockstep = settings.clock == "lockstep"
         self._pose_out = self.output(PoseStamped, "agv/pose")
         self._clock_out = self.output(Clock, "/clock", side=True)
+        self._transforms = TransformBroadcaster(self, FRAME_AGV)
         self.input(TwistStamped, "agv/cmd_vel", self._on_command)
         self.input(TimeReference, "agv/slot", self._on_slot)
         if self._lockstep:
@@ -98,8 +101,10 @@ class PlantNode(LoopNode[PlantParameters]):
     def _publish(self) -> None:
         stamp_ns = self.grid.stamp(self.k)
         self.report_every_second(stamp_ns)
+        pose = Pose(stamp_ns, *self.state)
         self._clock_out.publish(encode_clock(stamp_ns))
-        self._pose_out.publish(encode_pose(Pose(stamp_ns, *self.state)))
+        self._transforms.send(pose)
+        self._pose_out.publish(encode_pose(pose))
 
     def _advance(self, command: Command) -> None:
         """From step k to k + 1 under the newest command."""

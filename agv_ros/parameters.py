@@ -224,6 +224,11 @@ class LoopParameters:
         low=0.0,
         high=60.0,
     )
+    frame_prefix: str = parameter(
+        "",
+        "what the frames base_link and reference begin with, in messages and on /tf, as robot_state_publisher has it: "
+        "agv1/ for one AGV of several; the frame map is everyone's",
+    )
 
 
-SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout")
+SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "frame_prefix")

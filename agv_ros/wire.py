@@ -3,8 +3,9 @@
 rclpy takes and publishes serialised messages as they are (`raw=True`). Building a message object, converting it to C
 and serialising it costs five times as much as packing its few numbers directly, and a control loop consists of little
 else. So the loop's nodes speak CDR themselves, for exactly four types: geometry_msgs/PoseStamped,
-geometry_msgs/TwistStamped, nav_msgs/Odometry and sensor_msgs/TimeReference; and they write diagnostics and the clock,
-since rclpy leaves whatever memory held before in the gaps of a message, and equal runs shall have equal bytes.
+geometry_msgs/TwistStamped, nav_msgs/Odometry and sensor_msgs/TimeReference; and they write diagnostics, transforms and
+the clock, since rclpy leaves whatever memory held before in the gaps of a message, and equal runs shall have equal
+bytes.
 
 Theory of operation. A CDR stream is a 4-byte encapsulation header (byte 1: 1 little, 0 big endian) and the members in
 order, each aligned to its own size counted from the end of that header. Up to the last string the layout of a type is
@@ -180,9 +181,19 @@ def decode_pose(data: bytes) -> Pose:
     return Pose(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("pose", qx, qy, qz, qw))
 
 
-def encode_command(command: Command) -> bytes:
-    """geometry_msgs/TwistStamped in frame `base_link`."""
-    frame = FRAME_AGV.encode() + b"\0"
+def encode_transform(pose: Pose, child: str) -> bytes:
+    """tf2_msgs/TFMessage with one transform: where frame `child` is in frame `map`."""
+    frame, child_frame = FRAME_MAP.encode() + b"\0", child.encode() + b"\0"
+    layout = _layout("<", "IiI", (len(frame), len(child_frame)), "7d", 8)
+    z, w = quaternion_of_yaw(pose.theta)
+    return _LITTLE + layout.pack(
+        1, *_split(pose.stamp_ns), len(frame), frame, len(child_frame), child_frame, pose.x, pose.y, 0.0, 0.0, 0.0, z, w
+    )
+
+
+def encode_command(command: Command, prefix: str = "") -> bytes:
+    """geometry_msgs/TwistStamped in frame `base_link`, whose name begins with `prefix`."""
+    frame = (prefix + FRAME_AGV).encode() + b"\0"
     layout = _layout("<", "iI", (len(frame),), "6d", 8)
     return _LITTLE + layout.pack(*_split(command.stamp_ns), len(frame), frame, command.v, 0.0, 0.0, 0.0, 0.0, command.w)
 
@@ -200,9 +211,12 @@ def _odometry_layout(order: str, frame: int, child: int) -> struct.Struct:
     return _layout(order, "iI", (frame, child), "7d288x6d288x", 8)
 
 
-def encode_error(error: TrackingError) -> bytes:
-    """nav_msgs/Odometry: frame_id `base_link`, child_frame_id `reference`; covariances zero (unknown)."""
-    frame, child = FRAME_AGV.encode() + b"\0", FRAME_REFERENCE.encode() + b"\0"
+def encode_error(error: TrackingError, prefix: str = "") -> bytes:
+    """nav_msgs/Odometry: frame_id `base_link`, child_frame_id `reference`; covariances zero (unknown).
+
+    The names of both frames begin with `prefix`.
+    """
+    frame, child = (prefix + FRAME_AGV).encode() + b"\0", (prefix + FRAME_REFERENCE).encode() + b"\0"
     layout = _odometry_layout("<", len(frame), len(child))
     z, w = quaternion_of_yaw(error.theta_e)
     return _LITTLE + layout.pack(

@@ -114,7 +114,7 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
     return st.sampled_from(found.choices) if found.choices else st.text()
 
 
-ALONE = {"track", "wait_for_subscribers", "stop_timeout"}
+ALONE = {"track", "wait_for_subscribers", "stop_timeout", "frame_prefix"}
 """What a file may not set for one node without setting something else."""
 
 

@@ -17,6 +17,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability import bursts, lifted, mean_square, paper
 from agv_analysis.stability.margins import binding
+from agv_ros.parameters import SHARED
 
 _MOST_POINTS = 1200
 """Points of a line: the lowest and the highest of each pixel or two."""
@@ -54,8 +55,7 @@ def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
 
 def under_the_outages_of(pinned: Scenario, scenario: Scenario) -> Scenario:
     """The pinned scenario on the channel, and with the seed, of another one: slot by slot the same is lost."""
-    shared = ("ts", "start_time", "wait_for_subscribers", "stop_timeout")
-    own = {name: getattr(pinned.relay, name) for name in shared}
+    own = {name: getattr(pinned.relay, name) for name in SHARED}
     return dataclasses.replace(pinned, relay=dataclasses.replace(scenario.relay, **own))
 
 
