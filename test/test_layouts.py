@@ -77,6 +77,22 @@ def test_plotjuggler_s_plots_are_not_empty(sample: Bag) -> None:
         assert np.ptp(column) > 0.0, name
 
 
+def test_plotjuggler_s_layout_has_the_form_that_it_reads() -> None:
+    # as its own reader goes through it: PlotDocker::restoreSplitter and PlotWidget::xmlLoadState
+    root = ET.parse(CONFIG / "plotjuggler.xml").getroot()
+    assert [tab.tag for tab in root.find("tabbed_widget") or ()] == ["Tab", "Tab"]
+    for splitter in root.iter("DockSplitter"):
+        assert splitter.get("orientation") in ("|", "-")
+        sizes = [float(size) for size in splitter.get("sizes", "").split(";")]
+        assert len(splitter) == int(splitter.get("count", "0")) == len(sizes)
+        assert sum(sizes) == pytest.approx(1.0, abs=1e-5)
+    for plot in root.iter("plot"):
+        assert plot.get("mode") in ("TimeSeries", "XYPlot")
+        for curve in plot.iter("curve"):
+            wanted = {"name", "color"} | ({"curve_x", "curve_y"} if plot.get("mode") == "XYPlot" else set())
+            assert set(curve.attrib) == wanted
+
+
 def test_foxglove_finds_every_path(sample: Bag) -> None:
     names = of_foxglove()
     assert len(names) >= 9
@@ -89,6 +105,14 @@ def test_foxglove_shows_every_panel_that_it_describes() -> None:
     layout = json.loads((CONFIG / "foxglove.json").read_text())
     shown = {text for text in strings(layout["layout"]) if re.match(r"\w+!", text)}
     assert shown == set(layout["configById"])
+
+
+def test_rviz_shows_every_display() -> None:
+    # a display is switched off until its configuration says otherwise
+    manager = yaml.safe_load((CONFIG / "agv_ncs.rviz").read_text())["Visualization Manager"]
+    assert [display["Name"] for display in manager["Displays"] if not display.get("Enabled")] == []
+    assert manager["Enabled"]
+    assert manager["Global Options"]["Fixed Frame"] == "map"
 
 
 def test_rviz_subscribes_to_what_there_is(sample: Bag) -> None:
