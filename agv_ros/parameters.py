@@ -7,9 +7,11 @@ names get a prefix, as in `uplink.p`). Nodes declare it to ROS, the runner and t
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 from agv_ros.errors import UserError
@@ -135,8 +137,13 @@ def group(schema: type[T]) -> T:
 _KINDS = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double_array"}
 
 
-def parameters_of(schema: type) -> dict[str, Parameter]:
+def parameters_of(schema: type) -> Mapping[str, Parameter]:
     """The parameters of a schema by their full (dotted) names, in the order of declaration."""
+    return _parameters_of(schema)
+
+
+@functools.cache  # a sweep asks for each of its points
+def _parameters_of(schema: type) -> Mapping[str, Parameter]:
     found: dict[str, Parameter] = {}
     for field in dataclasses.fields(schema):
         if "group" in field.metadata:
@@ -153,7 +160,7 @@ def parameters_of(schema: type) -> dict[str, Parameter]:
             length=length,
             **known,
         )
-    return found
+    return MappingProxyType(found)
 
 
 def check_values(schema: type, values: Mapping[str, object], owner: str = "") -> dict[str, Any]:
