@@ -37,7 +37,7 @@ Job = tuple[int, int]
 TWIN_OFFSET = 1e-6
 """A twin begins this far from the run [m, m, rad]: far above rounding, far below what makes the loop nonlinear."""
 
-_LARGEST_UNIT = 256
+_LARGEST_UNIT = 1024
 """Runs that one worker takes at once: enough to share the random numbers of a seed, few enough to tell of progress."""
 
 
@@ -87,10 +87,10 @@ class _Batch:
         self._track = [tracks.setdefault(kind, len(tracks)) for kind in kinds]
 
     def units(self, workers: int) -> list[list[Job]]:
-        """All runs in parts, several for each worker so that none waits long for another; seed after seed."""
+        """All runs in parts, seed after seed; several for each worker, if it is not alone, so that none waits long."""
         rows, columns = self.table.shape
         jobs = [(row, column) for column in range(columns) for row in range(rows)]
-        size = max(2, min(_LARGEST_UNIT, len(jobs) // (4 * workers)))
+        size = max(2, min(_LARGEST_UNIT, len(jobs) // (4 * workers if workers > 1 else 1)))
         return [jobs[first : first + size] for first in range(0, len(jobs), size)]
 
     def work(self, unit: list[Job]) -> int:
