@@ -14,7 +14,8 @@ from agv_ros.parameters import as_dict, parameters_of
 from agv_ros.params_file import read_sections
 
 CONFIG = Path(__file__).parent.parent / "config"
-LOOPS = sorted(path for path in CONFIG.glob("*.yaml") if set(read_sections(str(path))) & set(SCHEMAS))
+FILES = set(CONFIG.glob("*.yaml")) - {CONFIG / "play_qos.yaml"}  # which is for rosbag2's player
+LOOPS = sorted(path for path in FILES if set(read_sections(str(path))) & set(SCHEMAS))
 
 
 def differences(a: Scenario, b: Scenario) -> dict[str, tuple[Any, Any]]:
