@@ -29,6 +29,7 @@ from agv_ros.wire import stamp_of
 TOPICS: dict[str, type] = {
     "/clock": Clock,
     "agv/pose": PoseStamped,
+    "agv/ground_truth": PoseStamped,
     "edge/pose": PoseStamped,
     "edge/slot": TimeReference,
     "edge/error": Odometry,
@@ -51,12 +52,16 @@ class RecorderNode(LoopNode[RecorderParameters]):
         self._running: set[str] = set()
         self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
         describe = [self._describer(topic, kind) for topic, kind in zip(self._names, TOPICS.values(), strict=True)]
-        self._writer = BagWriter(Path(settings.bag), describe, _about(settings.params_file))
+        self._writer = BagWriter(Path(settings.bag), describe, self.about())
         self._now_ns: Callable[[int], int] = (
             (lambda stamp_ns: stamp_ns) if settings.log_time == "stamp" else (lambda _: time.time_ns())
         )
         for number, (topic, kind) in enumerate(TOPICS.items()):
             self.input(kind, topic, self._receiver(number))
+
+    def about(self) -> dict[str, str]:
+        """What is embedded in the bag. Raises UserError."""
+        return _about(self.settings.params_file)
 
     def _receiver(self, number: int) -> Callable[[bytes], None]:
         write, now_ns = self._writer.write, self._now_ns

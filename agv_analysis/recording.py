@@ -23,7 +23,9 @@ from agv_ros.wire import DELIVERED, yaw_of_quaternion
 
 Steps = NDArray[np.int64]
 
-TOPICS = ("agv/pose", "edge/pose", "edge/slot", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "agv/slot")
+TOPICS = (
+    "agv/pose", "agv/ground_truth", "edge/pose", "edge/slot", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "agv/slot",
+)  # fmt: skip
 
 _NEEDED = ("agv/pose", "edge/slot", "edge/error", "edge/cmd_vel")
 
@@ -95,6 +97,11 @@ class OnSteps(NamedTuple):
         return values
 
 
+_NOTHING = OnSteps(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.void), 0, 0)
+
+_NO_TRUTH = "the AGV measures its pose with noise, and agv/ground_truth is not in the recording: errors hold the noise"
+
+
 def _stamps(messages: NDArray[np.void], field: str) -> Steps:
     return np.asarray(messages[f"{field}.sec"].astype(np.int64) * NS_PER_S + messages[f"{field}.nanosec"])
 
@@ -123,10 +130,14 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         )
     n_ul, lost = _verdicts(slots, k, scenario.grid)
     downlink = on_steps.get("agv/slot")
+    sent = _postures(poses, "pose", k, scenario.plant.initial_pose[2])
+    true = on_steps.get("agv/ground_truth", _NOTHING)
+    knows = bool(true.at(k)[1].all())
     run = Run(
         scenario=scenario,
         k=k,
-        pose=_postures(poses, "pose", k, scenario.plant.initial_pose[2]),
+        pose=_postures(true, "pose", k, scenario.plant.initial_pose[2]) if knows else sent,
+        measured=sent if knows else None,
         reference=Reference(scenario.error_detector).first(int(k[-1]) + 1)[k],
         error=_errors(on_steps["edge/error"], k),
         command=_commands(on_steps["edge/cmd_vel"], k),
@@ -136,7 +147,8 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         source=source,
         unexplained=unexplained(on_steps, scenario.grid),
     )
-    return dataclasses.replace(run, notes=(*bag.problems, *_notes(on_steps, names), *_mismatch(run)))
+    unknown = () if knows or not scenario.plant.is_noisy else (_NO_TRUTH,)
+    return dataclasses.replace(run, notes=(*bag.problems, *_notes(on_steps, names), *_mismatch(run), *unknown))
 
 
 def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.bool_]]:
@@ -194,6 +206,8 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
         "edge/error": _where(on_steps["edge/slot"], lambda slots: _stamps(slots, "time_ref") >= grid.start_ns),
         "edge/cmd_vel": on_steps["edge/error"].k,
     }
+    if len(on_steps.get("agv/ground_truth", _NOTHING).k):
+        expected["agv/ground_truth"] = poses
     if "agv/slot" in on_steps:
         expected["agv/slot"] = on_steps["edge/cmd_vel"].k
         expected["agv/cmd_vel"] = _where(on_steps["agv/slot"], lambda slots: slots["source"] == DELIVERED.encode())
@@ -222,10 +236,10 @@ def _mismatch(run: Run) -> Iterator[str]:
     held = np.searchsorted(run.k, run.k - run.n_ul)
     known = (held < len(run)) & np.isfinite(run.error[:, 0])
     known[known] &= run.k[held[known]] == (run.k - run.n_ul)[known]
-    eps = body_errors(run.reference[known], run.pose[held[known]])
+    eps = body_errors(run.reference[known], run.sent_pose[held[known]])
     difference = run.error[known] - eps
     difference[:, 2] = wrapped(difference[:, 2])
-    scale = 1.0 + np.abs(run.pose[held[known], :2]).max(axis=1, initial=0.0)
+    scale = 1.0 + np.abs(run.sent_pose[held[known], :2]).max(axis=1, initial=0.0)
     wrong = np.count_nonzero(np.abs(difference).max(axis=1, initial=0.0) > _SAME_ERROR * scale)
     if wrong:
         yield (

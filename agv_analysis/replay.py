@@ -119,7 +119,7 @@ def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
     prediction = Prediction(STEPS[scenario.error_detector.integration], run.ts)
     for i in np.flatnonzero(there).tolist():
         k, taken = int(run.k[i]), int(run.k[held[i]])
-        pose = Posture(*run.pose[held[i]].tolist())
+        pose = Posture(*run.sent_pose[held[i]].tolist())
         if predicts:
             pose = prediction.at(k, taken, pose)
         at_edge = received(at_rest(*pose), *pose, *reference[taken][:3], k - taken)

@@ -21,7 +21,7 @@ class Run:
     k: NDArray[np.int64]
     """Steps, shape (N,), increasing; without gaps unless messages are missing."""
     pose: Floats
-    """X_c(k) = x, y, theta of the AGV, shape (N, 3); theta counts turns."""
+    """X_c(k) = x, y, theta of the AGV, shape (N, 3); theta counts turns. The true one, if the run knows it."""
     reference: Floats
     """X_r(k) and its speeds: x, y, theta, v_r, w_r, shape (N, 5); theta counts turns."""
     error: Floats
@@ -40,8 +40,15 @@ class Run:
     """Messages by topic that are missing although no channel lost them; with any of them the run proves nothing."""
     notes: tuple[str, ...] = ()
     """What a reader must know of the recording: damage, repeated steps, parameters that do not fit."""
+    measured: Floats | None = None
+    """The poses that the AGV measured and sent, shape (N, 3), where they are not the true ones; see `sent_pose`."""
     gains_known: bool = True
     """Are the gains and limits in `scenario.controller` those of the run? Else they mean nothing."""
+
+    @property
+    def sent_pose(self) -> Floats:
+        """What the AGV sent of its pose, shape (N, 3): all that the edge can know."""
+        return self.pose if self.measured is None else self.measured
 
     @property
     def ts(self) -> float:

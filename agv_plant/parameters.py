@@ -47,9 +47,39 @@ class PlantParameters(LoopParameters):
     )
     w_max: float = parameter(math.inf, "limit on |w|, .inf: none", unit="rad/s", above=0.0, high=math.inf)
     a_max: float = parameter(math.inf, "limit on |dv/dt|, .inf: none", unit="m/s^2", above=0.0, high=math.inf)
+    j_max: float = parameter(math.inf, "limit on |d2v/dt2|, .inf: none", unit="m/s^3", above=0.0, high=math.inf)
     lag: float = parameter(
         0.0, "time constant with which the drive follows a command; 0: at once", unit="s", low=0.0, high=60.0
     )
+    slip: float = parameter(
+        0.0, "slip ratio of the wheels: share of a wheel's speed that the ground does not see", low=-1.0, high=1.0
+    )
+    slip_noise: float = parameter(
+        0.0, "standard deviation of the slip ratio, drawn anew in each step, for each of the two wheels", low=0.0,
+        high=1.0,
+    )  # fmt: skip
+    track_width: float = parameter(0.5, "distance between the wheels, if they slip", unit="m", above=0.0, high=100.0)
+    skid: float = parameter(
+        0.0, "outward side-slip angle over lateral acceleration v w: mass over cornering stiffness", unit="s^2/m",
+        low=0.0, high=1.0,
+    )  # fmt: skip
+    substeps: int = parameter(
+        1, "equal parts in which a period is integrated, each with the speed that the drive has by then", low=1,
+        high=1000,
+    )  # fmt: skip
+    noise_xy: float = parameter(
+        0.0, "standard deviation of x and of y in agv/pose; the true pose is then on agv/ground_truth", unit="m",
+        low=0.0, high=100.0,
+    )  # fmt: skip
+    noise_theta: float = parameter(0.0, "the same of theta", unit="rad", low=0.0, high=10.0)
+    seed: int = parameter(
+        1, "seed of noise and slip; a sweep's seeds, and agv-ncs run --seed, set it with relay.seed", low=0, high=2**62
+    )
+
+    @property
+    def is_noisy(self) -> bool:
+        """Does the AGV measure another pose than its true one?"""
+        return self.noise_xy > 0.0 or self.noise_theta > 0.0
 
 
 @dataclass(frozen=True)

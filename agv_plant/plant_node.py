@@ -17,12 +17,13 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
-from agv_plant.actuator import driven_speeds
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.held_command import HeldCommand
+from agv_plant.motion import NOISE, SLIP, Motion, body_of, measured, move
 from agv_plant.parameters import PlantParameters
 from agv_plant.punctuality import Punctuality
-from agv_plant.unicycle import STEPS, State
+from agv_plant.random_stream import Normals
+from agv_plant.unicycle import State
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
@@ -67,9 +68,10 @@ class PlantNode(LoopNode[PlantParameters]):
         self.k = 0
         self.steps = math.inf if math.isinf(settings.duration) else max(1, round(settings.duration / settings.ts))
         self._steps_per_line = max(1, round(self.steps / 20 if math.isfinite(self.steps) else 10.0 / settings.ts))
-        self.state = State(*settings.initial_pose)
-        self._step = STEPS[settings.integration]
-        self._speeds = (0.0, 0.0)
+        self._motion = Motion(*settings.initial_pose)
+        self._body = body_of(settings)
+        self._noise = Normals(settings.seed, NOISE)
+        self._slip = Normals(settings.seed, SLIP)
         self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
         self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
         self._held = HeldCommand(to_nanoseconds(settings.cmd_vel_timeout))
@@ -77,12 +79,18 @@ class PlantNode(LoopNode[PlantParameters]):
         self._lockstep = settings.clock == "lockstep"
         self._pose_out = self.output(PoseStamped, "agv/pose")
         self._clock_out = self.output(Clock, "/clock", side=True)
+        self._truth_out = self.output(PoseStamped, "agv/ground_truth", side=True) if settings.is_noisy else None
         self._transforms = TransformBroadcaster(self, FRAME_AGV)
         self.input(TwistStamped, "agv/cmd_vel", self._on_command)
         self.input(TimeReference, "agv/slot", self._on_slot)
         if self._lockstep:
             self._watch_for_answers()
         self.poll(self._begin)
+
+    @property
+    def state(self) -> State:
+        """The true pose."""
+        return State(*self._motion[:3])
 
     def _begin(self) -> bool:
         wanted = max(self.settings.wait_for_subscribers, self._lockstep)
@@ -101,24 +109,31 @@ class PlantNode(LoopNode[PlantParameters]):
     def _publish(self) -> None:
         stamp_ns = self.grid.stamp(self.k)
         self.report_every_second(stamp_ns)
-        pose = Pose(stamp_ns, *self.state)
+        pose = self._measured_pose()
         self._clock_out.publish(encode_clock(stamp_ns))
+        if self._truth_out is not None:
+            self._truth_out.publish(encode_pose(Pose(stamp_ns, *self.state)))
         self._transforms.send(pose)
         self._pose_out.publish(encode_pose(pose))
+
+    def _measured_pose(self) -> Pose:
+        """What the AGV makes known of its pose at step k."""
+        plant, stamp_ns = self.settings, self.grid.stamp(self.k)
+        if not plant.is_noisy:
+            return Pose(stamp_ns, *self.state)
+        n_x, n_y, n_theta, _ = self._noise.at(self.k)
+        return Pose(stamp_ns, *measured(*self.state, n_x, n_y, n_theta, plant.noise_xy, plant.noise_theta))
 
     def _advance(self, command: Command) -> None:
         """From step k to k + 1 under the newest command."""
         plant, age = self.settings, (self.grid.stamp(self.k) - command.stamp_ns) // self.grid.ts_ns
         share = share_of_command(age, self._downlink_policy, plant.ramp_time / plant.ts)
-        self._speeds = driven_speeds(
-            share * command.v, share * command.w, *self._speeds, plant.ts, plant.w_max, plant.a_max, plant.lag
-        )
-        v, w = self._speeds
-        state = State(*self._step(*self.state, plant.speed_scale * v, w, plant.ts))
-        if not all(map(math.isfinite, state)):
+        n_left, n_right = self._slip.at(self.k)[:2] if plant.slip_noise > 0.0 else (0.0, 0.0)
+        motion = move(self._motion, share * command.v, share * command.w, n_left, n_right, self._body)
+        if not all(map(math.isfinite, motion[:3])):
             self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")
             return
-        self.state = state
+        self._motion = motion
         self.k += 1
         if self.k >= self.steps:
             self.finished = True
@@ -165,7 +180,7 @@ class PlantNode(LoopNode[PlantParameters]):
                 self.fail(self._no_answer())
             elif self.k == 0 and now - max(since, repeated) > _REPEAT_AFTER and self._pose_out.count:
                 repeated = now
-                self._pose_out.publish(encode_pose(Pose(self.grid.stamp(0), *self.state)))
+                self._pose_out.publish(encode_pose(self._measured_pose()))
 
         self.create_timer(min(0.1, self.settings.answer_timeout / 4.0), watch, clock=self._steady)
 

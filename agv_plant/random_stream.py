@@ -1,4 +1,4 @@
-"""Uniform random numbers that are a pure function of (seed, stream name, k).
+"""Random numbers that are a pure function of (seed, stream name, k).
 
 Counter-based (Philox 4x64): slot k owns the k-th counter value and so four numbers of its own, whatever was asked for
 before, in whatever order, by whatever process. Only numpy's raw bit stream is used, whose values numpy guarantees
@@ -8,11 +8,15 @@ across versions, unlike those of `Generator.random` (NEP 19).
 from __future__ import annotations
 
 import hashlib
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 DRAWS = 4
+
+_BLOCK = 64
+"""Steps whose normal numbers are made at once: in real time that must take no time to speak of."""
 
 
 def uniforms(seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
@@ -21,3 +25,30 @@ def uniforms(seed: int, stream: str, first: int, count: int) -> NDArray[np.float
     raw: NDArray[np.uint64] = np.random.Philox(key=key, counter=first).random_raw(count * DRAWS)
     # The top 53 bits fill a double's mantissa exactly.
     return np.asarray((raw >> np.uint64(11)) * 2.0**-53).reshape(count, DRAWS)
+
+
+def normal_pair(u_radius: float, u_angle: float) -> tuple[float, float]:
+    """Two independent standard normal numbers from two that are uniform in [0, 1).
+
+    Source: Box and Muller, A note on the generation of random normal deviates, 1958.
+    """
+    radius, angle = math.sqrt(-2.0 * math.log(1.0 - u_radius)), 2.0 * math.pi * u_angle
+    return radius * math.cos(angle), radius * math.sin(angle)
+
+
+class Normals:
+    """Standard normal numbers of one stream, DRAWS for each step, whatever step was asked for before."""
+
+    def __init__(self, seed: int, stream: str) -> None:
+        self._seed, self._stream = seed, stream
+        self._first = -1
+        self._block: list[tuple[float, float, float, float]] = []
+
+    def at(self, k: int) -> tuple[float, float, float, float]:
+        """Those of step k >= 0."""
+        first = k - k % _BLOCK
+        if first != self._first:
+            rows = uniforms(self._seed, self._stream, first, _BLOCK).tolist()
+            self._block = [(*normal_pair(a, b), *normal_pair(c, d)) for a, b, c, d in rows]
+            self._first = first
+        return self._block[k - first]

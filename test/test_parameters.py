@@ -34,6 +34,8 @@ EVERY_PARAMETER = [
 
 UNITLESS = (
     "speed_scale",
+    "slip",
+    "slip_noise",
     *(f"{link}.{name}" for link in ("uplink", "downlink") for name in (*"prhk", "arguments", "correlation")),
 )
 """The only doubles without a unit."""
@@ -75,7 +77,7 @@ def test_every_double_refuses_what_is_no_number_and_what_is_an_integer(found: Pa
     assert refusal(found, 25).endswith("is a double, got the integer 25: write 25.0")
     for value in (True, "25.0", None, [1.0], 1 + 0j):
         assert refusal(found, value).endswith(f"is a double, got {value!r}")
-    if found.name not in ("v_max", "duration", "w_max", "a_max"):
+    if found.name not in ("v_max", "duration", "w_max", "a_max", "j_max"):
         assert "got inf" in refusal(found, math.inf)
     else:
         assert found.check("node", math.inf) == math.inf

@@ -37,6 +37,15 @@ RUNS = {
         "relay.downlink.model=burst", "relay.downlink.n=9", "plant.downlink_policy=ramp", "plant.ramp_time=0.03",
     ),
     "a heavy AGV": (*LOSSY, "plant.a_max=3.0", "plant.lag=0.02", "plant.w_max=1.5", "error_detector.track=eight"),
+    "smooth, in parts": (*LOSSY, "plant.j_max=400.0", "plant.a_max=20.0", "plant.substeps=5", "plant.lag=0.01"),
+    "slips and skids": (
+        *LOSSY, "plant.slip=0.05", "plant.slip_noise=0.05", "plant.skid=0.02", "plant.seed=5", "plant.integration=arc",
+        "error_detector.track=eight", "controller.v_max=3.0",
+    ),
+    "noisy": (*LOSSY, "plant.noise_xy=0.02", "plant.noise_theta=0.05", "plant.seed=9", "controller.v_max=6.0"),
+    "noisy, predicted": (
+        *LOSSY, "plant.noise_xy=0.02", "error_detector.policy=predict", "plant.slip_noise=0.05", "controller.v_max=3.0",
+    ),
 }  # fmt: skip
 
 
@@ -90,7 +99,9 @@ def agree(recorded: Run) -> None:
     assert len(recorded) == len(simulated) == round(recorded.scenario.plant.duration / recorded.ts)
     for verdict in ("lost", "downlink_lost", "n_ul"):
         assert np.array_equal(getattr(recorded, verdict), getattr(simulated, verdict)), verdict
+    assert (recorded.measured is None) == (simulated.measured is None)
     np.testing.assert_allclose(recorded.pose, simulated.pose, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(recorded.sent_pose, simulated.sent_pose, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(recorded.reference, simulated.reference, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(recorded.error[:, :2], simulated.error[:, :2], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(np.sin(recorded.error[:, 2] - simulated.error[:, 2]), 0.0, atol=1e-9)

@@ -15,7 +15,7 @@ from agv_analysis.commands import with_settings
 @click.option("--clock", type=click.Choice(["lockstep", "realtime"]), help="As --set plant.clock=...")
 @click.option("--processes", is_flag=True, help="One process for each node instead of one for all.")
 @click.option("--duration", type=float, help="As --set plant.duration=... [s]; cuts the run short.")
-@click.option("--seed", type=int, help="As --set relay.seed=...")
+@click.option("--seed", type=int, help="As --set relay.seed=... --set plant.seed=...")
 def command(
     params: str,
     settings: tuple[str, ...],
@@ -35,7 +35,7 @@ def command(
     """
     from agv_analysis.scenario import load_scenario
 
-    shorthands = {"plant.clock": clock, "plant.duration": duration, "relay.seed": seed}
+    shorthands = {"plant.clock": clock, "plant.duration": duration, "relay.seed": seed, "plant.seed": seed}
     given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
     scenario = load_scenario(params, (*settings, *given))
     try:

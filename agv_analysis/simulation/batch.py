@@ -16,10 +16,19 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.loop import Case, Statistics, at_rest, statistics, statistics_of_twins, statistics_of_two
+from agv_analysis.simulation.loop import (
+    NONE,
+    Case,
+    Statistics,
+    at_rest,
+    statistics,
+    statistics_of_twins,
+    statistics_of_two,
+)
 from agv_analysis.simulation.single import reference_of, settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
+from agv_plant.motion import NOISE, SLIP
 
 STATISTICS = np.dtype([
     *((name, np.dtype(kind)) for name, kind in get_type_hints(Statistics).items()), ("contraction", np.dtype(float))
@@ -53,9 +62,10 @@ def simulate_batch(
     With `twins`, which takes twice the time, every run has a twin that begins a micrometre away and meets the same
     losses: their contraction says whether the loop is stable along this run.
 
-    Seeds are paired: under one seed all scenarios with the same channel meet the same outages; `relay.seed` of the
-    scenarios does not count. `workers` threads, one a core by default, do the work; their number changes nothing in the
-    result. `progress` is told how many runs are done. Raises UserError if a run has no end.
+    Seeds are paired: under one seed all scenarios with the same channel meet the same outages, and all AGVs the same
+    noise and slip; `relay.seed` and `plant.seed` of the scenarios do not count. `workers` threads, one a core by
+    default, do the work; their number changes nothing in the result. `progress` is told how many runs are done. Raises
+    UserError if a run has no end.
     """
     batch, workers, done = _Batch(scenarios, seeds, twins), workers or cores(), 0
     with ThreadPoolExecutor(workers) as pool:
@@ -125,9 +135,12 @@ class _Batch:
     def _case(self, job: Job, airs: Airs) -> Case:
         row, column = job
         scenario, air = self._scenarios[row], airs(self._seeds[column], self._steps[row])
+        settings = settings_of(scenario)
         return Case(
             numbers(air.verdicts(scenario.relay.uplink, "uplink")),
             numbers(air.verdicts(scenario.relay.downlink, "downlink")),
             at_rest(*scenario.plant.initial_pose),
-            settings_of(scenario),
+            settings,
+            numbers(air.normals(NOISE)) if settings.noisy else numbers(NONE),
+            numbers(air.normals(SLIP)) if settings.slips else numbers(NONE),
         )

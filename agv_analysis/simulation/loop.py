@@ -18,12 +18,15 @@ from agv_analysis.convergence import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.actuator import driven_speeds
 from agv_plant.downlink_policy import share_of_command
-from agv_plant.unicycle import arc_step, euler_step
+from agv_plant.motion import Body, Motion, measured, move, plant_step
+from agv_plant.random_stream import DRAWS
 
 Rows = NDArray[np.float64] | list[list[float]]
 Flags = NDArray[np.bool_] | list[bool]
+
+NONE = np.empty((0, DRAWS))
+"""Random numbers of a run that needs none."""
 
 
 class Settings(NamedTuple):
@@ -34,20 +37,21 @@ class Settings(NamedTuple):
     ktheta: float
     v_max: float
     ts: float
-    arc: bool
-    """Does the plant integrate along the arc, or by Euler?"""
     policy: int
     """Staleness policy at the edge, one of `staleness.HOLD`, `ALIGN`, `PREDICT`."""
     model_arc: bool
-    """The same as `arc`, for the edge's model of the plant."""
+    """Does the edge's model of the plant integrate along the arc, or by Euler?"""
     plain: bool
     """Is the plant the paper's? Then what follows is at its defaults and need not be looked at."""
     downlink_policy: int
     ramp_steps: float
-    speed_scale: float
-    w_max: float
-    a_max: float
-    lag: float
+    body: Body
+    slips: bool
+    """Are there random numbers for the wheels?"""
+    noisy: bool
+    """Is the pose that the AGV measures another than the true one?"""
+    noise_xy: float
+    noise_theta: float
 
 
 class Loop(NamedTuple):
@@ -74,6 +78,8 @@ class Loop(NamedTuple):
     v_driven: float
     """The speeds that the plant drove at in the period before."""
     w_driven: float
+    a_driven: float
+    """Its acceleration in that period."""
 
 
 class Answer(NamedTuple):
@@ -93,37 +99,37 @@ class Case(NamedTuple):
     downlink_lost: Flags
     start: Loop
     settings: Settings
+    noise: Rows = NONE
+    """Normal numbers of its slots for the measured pose, shape (N, 4); empty if there is no noise."""
+    slip: Rows = NONE
+    """The same for the wheels."""
 
 
 def at_rest(x: float, y: float, theta: float) -> Loop:
     """The loop before slot 0 with the AGV at a pose in frame `map` [m, m, rad]."""
-    return Loop(x, y, theta, x, y, theta, math.nan, math.nan, math.nan, 0, 0.0, 0.0, 0, 0.0, 0.0)
+    return Loop(x, y, theta, x, y, theta, math.nan, math.nan, math.nan, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0)
 
 
 # -- one slot ----------------------------------------------------------------------------------------------------------
 
 
 def slot(
-    loop: Loop,
-    x_r: float,
-    y_r: float,
-    theta_r: float,
-    v_r: float,
-    w_r: float,
-    lost: bool,
-    downlink_lost: bool,
-    settings: Settings,
+    loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: Case, k: int
 ) -> tuple[Loop, Answer]:
-    """From one pose to the next, under the verdicts of both links and with the reference at this step."""
+    """From one pose to the next, under the verdicts of both links on slot k and with the reference at this step."""
     x, y, theta = loop.x, loop.y, loop.theta
-    if lost:
-        held = outdated(loop)
+    lost, downlink_lost, settings = case.lost[k], case.downlink_lost[k], case.settings
+    n_left = n_right = 0.0
+    if settings.slips:
+        n_left, n_right = case.slip[k][0], case.slip[k][1]
+    if lost or settings.noisy:
+        held = outdated(loop) if lost else perceived(loop, x_r, y_r, theta_r, case.noise, k, settings)
         sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
-        return obey(held, sent, downlink_lost, settings), sent
+        return obey(held, sent, downlink_lost, n_left, n_right, settings), sent
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
     held = received(loop, x, y, theta, x_r, y_r, theta_r, 0)
     sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
-    return obey(held, sent, downlink_lost, settings), sent
+    return obey(held, sent, downlink_lost, n_left, n_right, settings), sent
 
 
 def outdated(loop: Loop) -> Loop:
@@ -131,6 +137,7 @@ def outdated(loop: Loop) -> Loop:
     return Loop(
         loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
         loop.theta_then, loop.n_ul + 1, loop.v, loop.w, loop.n_dl, loop.v_driven, loop.w_driven,
+        loop.a_driven,
     )  # fmt: skip
 
 
@@ -140,8 +147,26 @@ def received(
     """The edge holds a pose that was taken n_ul steps ago, when the reference was at (x_then, y_then, theta_then)."""
     return Loop(
         loop.x, loop.y, loop.theta, x, y, theta, x_then, y_then, theta_then, n_ul, loop.v, loop.w, loop.n_dl,
-        loop.v_driven, loop.w_driven,
+        loop.v_driven, loop.w_driven, loop.a_driven,
     )  # fmt: skip
+
+
+def commanded(loop: Loop, v: float, w: float, n_dl: int) -> Loop:
+    """The plant holds a command that was sent n_dl steps ago [m/s, rad/s]."""
+    return Loop(
+        loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
+        loop.theta_then, loop.n_ul, v, w, n_dl, loop.v_driven, loop.w_driven, loop.a_driven,
+    )  # fmt: skip
+
+
+def perceived(
+    loop: Loop, x_then: float, y_then: float, theta_then: float, noise: Rows, k: int, settings: Settings
+) -> Loop:
+    """The edge holds the pose of now, as the AGV measures it."""
+    x, y, theta = measured(
+        loop.x, loop.y, loop.theta, noise[k][0], noise[k][1], noise[k][2], settings.noise_xy, settings.noise_theta
+    )
+    return received(loop, x, y, theta, x_then, y_then, theta_then, 0)
 
 
 def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings) -> Answer:
@@ -158,23 +183,22 @@ def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: 
     return Answer(x_e, y_e, theta_e, limit_speed(v, settings.v_max), w)
 
 
-def obey(loop: Loop, sent: Answer, lost: bool, settings: Settings) -> Loop:
+def obey(loop: Loop, sent: Answer, lost: bool, n_left: float, n_right: float, settings: Settings) -> Loop:
     """One sampling period of the plant under the freshest command, and of the edge's model under the one it sent.
 
-    A command beyond the range of numbers is refused by the plant, which goes on with the one before.
+    n_left and n_right are the wheels' normal numbers. A command beyond the range of numbers is refused by the plant,
+    which goes on with the one before.
     """
     v, w, n_dl = sent.v, sent.w, 0
     if lost or not are_finite(v, w, 0.0):
         v, w, n_dl = loop.v, loop.w, loop.n_dl + 1
-    v_driven, w_driven, speed = v, w, v
-    if not settings.plain:
+    if settings.plain:
+        v_driven, w_driven, a_driven = v, w, 0.0
+        x, y, theta = plant_step(settings.body.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
+    else:
         share = share_of_command(n_dl, settings.downlink_policy, settings.ramp_steps)
-        v_driven, w_driven = driven_speeds(
-            share * v, share * w, loop.v_driven, loop.w_driven, settings.ts, settings.w_max, settings.a_max,
-            settings.lag,
-        )  # fmt: skip
-        speed = settings.speed_scale * v_driven
-    x, y, theta = plant_step(settings.arc, loop.x, loop.y, loop.theta, speed, w_driven, settings.ts)
+        before = Motion(loop.x, loop.y, loop.theta, loop.v_driven, loop.w_driven, loop.a_driven)
+        x, y, theta, v_driven, w_driven, a_driven = move(before, share * v, share * w, n_left, n_right, settings.body)
     x_held, y_held, theta_held = loop.x_held, loop.y_held, loop.theta_held
     if settings.policy == PREDICT and are_finite(sent.v, sent.w, 0.0):
         x_held, y_held, theta_held = plant_step(
@@ -182,17 +206,8 @@ def obey(loop: Loop, sent: Answer, lost: bool, settings: Settings) -> Loop:
         )
     return Loop(
         x, y, theta, x_held, y_held, theta_held, loop.x_then, loop.y_then, loop.theta_then, loop.n_ul, v, w, n_dl,
-        v_driven, w_driven,
+        v_driven, w_driven, a_driven,
     )  # fmt: skip
-
-
-def plant_step(
-    arc: bool, x: float, y: float, theta: float, v: float, w: float, ts: float
-) -> tuple[float, float, float]:
-    """One sampling period by the one or the other integration."""
-    if arc:
-        return arc_step(x, y, theta, v, w, ts)
-    return euler_step(x, y, theta, v, w, ts)
 
 
 def goes_on(loop: Loop, sent: Answer) -> bool:
@@ -217,7 +232,7 @@ def history(reference: Rows, case: Case, rows: NDArray[np.float64], n_ul: NDArra
     for k in range(len(case.lost)):
         x_r, y_r, theta_r, v_r, w_r = reference[k]
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
-        loop, sent = slot(loop, x_r, y_r, theta_r, v_r, w_r, case.lost[k], case.downlink_lost[k], case.settings)
+        loop, sent = slot(loop, x_r, y_r, theta_r, v_r, w_r, case, k)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
         n_ul[k] = loop.n_ul
@@ -276,13 +291,15 @@ def begin(reference: Rows, case: Case) -> Drive:
     return Drive(case.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
-def proceed(
-    run: Drive, k: int, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, lost: bool,
-    downlink_lost: bool, settings: Settings,
-) -> Drive:  # fmt: skip
+def proceed(run: Drive, k: int, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: Case) -> Drive:
     """The run after slot k."""
+    loop, sent = slot(run.loop, x_r, y_r, theta_r, v_r, w_r, case, k)
+    return seen(run, k, x_r, y_r, loop, sent)
+
+
+def seen(run: Drive, k: int, x_r: float, y_r: float, loop: Loop, sent: Answer) -> Drive:
+    """The run after slot k, at which the reference was at (x_r, y_r), from the loop after it and what the edge sent."""
     dx, e = x_r - run.loop.x, y_r - run.loop.y
-    loop, sent = slot(run.loop, x_r, y_r, theta_r, v_r, w_r, lost, downlink_lost, settings)
     size, square = abs(e), dx * dx + e * e
     return Drive(
         loop,
@@ -328,7 +345,7 @@ def statistics(reference: Rows, case: Case) -> Statistics:
     run = begin(reference, case)
     for k in range(len(case.lost)):
         x_r, y_r, theta_r, v_r, w_r = reference[k]
-        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, case.lost[k], case.downlink_lost[k], case.settings)
+        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, case)
         if not run.goes_on:
             break
     return end(run, reference[0][1] - case.start.y, case.settings.ts)
@@ -343,11 +360,9 @@ def statistics_of_two(reference: Rows, one: Case, other: Case) -> tuple[Statisti
     for k in range(len(one.lost)):
         x_r, y_r, theta_r, v_r, w_r = reference[k]
         if first.goes_on:
-            first = proceed(first, k, x_r, y_r, theta_r, v_r, w_r, one.lost[k], one.downlink_lost[k], one.settings)
+            first = proceed(first, k, x_r, y_r, theta_r, v_r, w_r, one)
         if second.goes_on:
-            second = proceed(
-                second, k, x_r, y_r, theta_r, v_r, w_r, other.lost[k], other.downlink_lost[k], other.settings
-            )
+            second = proceed(second, k, x_r, y_r, theta_r, v_r, w_r, other)
     y_r = reference[0][1]
     return end(first, y_r - one.start.y, one.settings.ts), end(second, y_r - other.start.y, other.settings.ts)
 
@@ -361,10 +376,9 @@ def statistics_of_twins(reference: Rows, case: Case, twin: Loop) -> tuple[Statis
     run, begun, ends = begin(reference, case), twin, False
     for k in range(len(case.lost)):
         x_r, y_r, theta_r, v_r, w_r = reference[k]
-        lost, downlink_lost = case.lost[k], case.downlink_lost[k]
-        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, lost, downlink_lost, case.settings)
+        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, case)
         if not ends:
-            twin, sent = slot(twin, x_r, y_r, theta_r, v_r, w_r, lost, downlink_lost, case.settings)
+            twin, sent = slot(twin, x_r, y_r, theta_r, v_r, w_r, case, k)
             ends = not goes_on(twin, sent)
         if not run.goes_on:
             break

@@ -11,18 +11,18 @@ import numpy as np
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.loop import Case, Settings, at_rest, history
+from agv_analysis.simulation.chance import measurements, normals
+from agv_analysis.simulation.loop import NONE, Case, Settings, at_rest, history
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
 from agv_cloud.staleness import POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
+from agv_plant.motion import NOISE, SLIP, body_of
 from agv_plant.parameters import PlantParameters
 from agv_plant.radio import losses
 from agv_ros.errors import UserError
 
-_PAPERS_PLANT = {
-    name: getattr(PlantParameters(), name) for name in ("downlink_policy", "speed_scale", "w_max", "a_max", "lag")
-}
+_PAPERS_BODY = body_of(PlantParameters())
 
 
 def simulate(scenario: Scenario) -> Run:
@@ -36,14 +36,17 @@ def simulate(scenario: Scenario) -> Run:
     lost = losses(relay.uplink, relay.seed, "uplink", steps)
     downlink_lost = losses(relay.downlink, relay.seed, "downlink", steps)
     rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
-    start, settings = at_rest(*scenario.plant.initial_pose), settings_of(scenario)
-    done = compiled(history)(
-        numbers(reference), Case(numbers(lost), numbers(downlink_lost), start, settings), rows, n_ul
-    )
+    plant, start, settings = scenario.plant, at_rest(*scenario.plant.initial_pose), settings_of(scenario)
+    noise = normals(plant.seed, NOISE, steps) if settings.noisy else NONE
+    slip = normals(plant.seed, SLIP, steps) if settings.slips else NONE
+    case = Case(numbers(lost), numbers(downlink_lost), start, settings, numbers(noise), numbers(slip))
+    done = compiled(history)(numbers(reference), case, rows, n_ul)
+    pose = rows[:done, 0:3]
     return Run(
         scenario=scenario,
         k=np.arange(done),
-        pose=rows[:done, 0:3],
+        pose=pose,
+        measured=measurements(pose, noise, plant.noise_xy, plant.noise_theta) if settings.noisy else None,
         reference=reference[:done],
         error=rows[:done, 3:6],
         command=rows[:done, 6:8],
@@ -89,15 +92,17 @@ def steps_of(scenario: Scenario) -> int:
 def settings_of(scenario: Scenario) -> Settings:
     """What a slot of the loop needs to know of a scenario."""
     gains, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
+    body = body_of(plant)
     return Settings(
         kx=gains.kx, ky=gains.ky, ktheta=gains.ktheta, v_max=gains.v_max, ts=plant.ts,
-        arc=plant.integration == "arc",
         policy=POLICIES.index(edge.policy),
         model_arc=edge.integration == "arc",
-        plain=all(getattr(plant, name) == value for name, value in _PAPERS_PLANT.items()),
+        plain=body._replace(arc=_PAPERS_BODY.arc, ts=_PAPERS_BODY.ts) == _PAPERS_BODY
+        and plant.downlink_policy == "hold",
         downlink_policy=DOWNLINK_POLICIES.index(plant.downlink_policy),
         ramp_steps=plant.ramp_time / plant.ts,
-        speed_scale=plant.speed_scale, w_max=plant.w_max, a_max=plant.a_max, lag=plant.lag,
+        body=body, slips=plant.slip_noise > 0.0,
+        noisy=plant.is_noisy, noise_xy=plant.noise_xy, noise_theta=plant.noise_theta,
     )  # fmt: skip
 
 

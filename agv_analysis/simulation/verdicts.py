@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled, numbers
+from agv_analysis.simulation.chance import normals
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.installed import TRACE, find_model
 from agv_plant.parameters import ChannelParameters
@@ -34,6 +35,8 @@ class Air:
         self._steps = steps
         self._seed = seed
         self._shared = functools.cache(lambda stream: draws(ChannelParameters(), seed, stream, 0, steps))
+        self.normals = functools.cache(lambda stream: normals(seed, stream, steps))
+        """Normal numbers of a stream of the AGV's, shape (steps, DRAWS)."""
         self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
 
     def verdicts(self, channel: ChannelParameters, stream: str) -> Verdicts:

@@ -124,8 +124,9 @@ class Sweep:
         twice = [name for name in names if names.count(name) > 1]
         if twice:
             raise SweepError(f"--vary {twice[0]}: the parameter is varied twice")
-        if "relay.seed" in names:
-            raise SweepError("--vary relay.seed: seeds are what --seeds counts, from relay.seed on")
+        for name in ("relay.seed", "plant.seed"):
+            if name in names:
+                raise SweepError(f"--vary {name}: seeds are what --seeds counts, from relay.seed on")
         if self.size > MAX_POINTS:
             raise SweepError(f"{self.size} points, at most {MAX_POINTS} are possible: take fewer values an axis")
         if self.seed_count < 1:
