@@ -14,7 +14,7 @@ from agv_analysis.run import Floats, Run
 from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
 from agv_analysis.stability.linearisation import Edge
-from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED, gains_at_true_speed
+from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED
 from agv_analysis.stability.verdict import Verdict, judge
 from agv_ros.errors import UserError
 
@@ -104,7 +104,7 @@ class Analysis(Observations):
     lifted_radius: float
     """Largest spectral radius of the lifted system over the track, for a pose as old as the oldest of the run.
 
-    As if it were fresh where it is predicted exactly; NaN where it is predicted by a wrong model.
+    As if it were fresh where it is predicted exactly; that of the whole run, per step, where the model is wrong.
     """
     bursts: BurstVerdict
     """Verdict for arbitrary bursts of up to as many lost poses as the longest outage of the run."""
@@ -117,9 +117,9 @@ class Analysis(Observations):
     verdict: Verdict
 
     @property
-    def lifted_stable(self) -> bool | None:
-        """Does the loop contract if every pose is as old as the oldest of the run? None where that is not computed."""
-        return None if np.isnan(self.lifted_radius) else self.lifted_radius < 1.0
+    def lifted_stable(self) -> bool:
+        """Does the loop contract if every pose is as old as the oldest of the run?"""
+        return self.lifted_radius < 1.0
 
     @property
     def bursts_stable(self) -> bool:
@@ -129,7 +129,7 @@ class Analysis(Observations):
     def disagreements(self) -> list[str]:
         """A sentence for each pair of criteria that say different things."""
         found = []
-        if self.paper.stable and self.lifted_stable is False:
+        if self.paper.stable and not self.lifted_stable:
             found.append(
                 f"the paper's test calls the loop stable, but a pose that is always {self.n} steps old makes the "
                 f"error grow by a factor {self.lifted_radius:.4f} a step: the test takes the outdated pose for the "
@@ -145,7 +145,7 @@ class Analysis(Observations):
                 f"the paper's test calls the loop unstable (|lambda| = {self.paper.radius:.6g} at step "
                 f"{self.paper.k}), but it contracts under any outages of up to {self.n} slots"
             )
-        if self.bursts_stable and self.lifted_stable is False:
+        if self.bursts_stable and not self.lifted_stable:
             found.append(
                 f"outages of up to {self.n} slots are survived, since a fresh pose follows each; a pose that is always "
                 f"{self.n} steps old is not"
@@ -190,40 +190,42 @@ def analyse(run: Run) -> Analysis:
         raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
     out, fit = outages(run), fit_channel(run.lost)
     v_r, w_r, gains = run.reference[:, 3], run.reference[:, 4], run.scenario.controller
-    edge, true = Edge.of(run.scenario), gains_at_true_speed(run.scenario)
+    edge = Edge.of(run.scenario)
     growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain, edge=edge) / len(run)
-    of_drops, of_motion = _contractions(run)
+    of_drops, of_motion = _contractions(run, edge)
     longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
     n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
-    n_seen = 0 if edge.is_exact else out.n_ul_max
     return Analysis(
         run=run,
         outages=out,
         convergence=convergence(run),
         paper=paper_test(run),
-        lifted_radius=(
-            np.nan if edge.predicts and not edge.is_exact else lifted.largest_radius(n_seen, v_r, w_r, true, run.ts)
-        ),
+        lifted_radius=_lifted_radius(out.n_ul_max, v_r, w_r, run, edge),
         bursts=bursts.verdict(out.n_ul_max, v_r, w_r, gains, run.ts, edge),
         fit=fit,
         mean_square_growth=growth,
         floquet=of_drops,
         contraction=of_motion,
-        verdict=judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run), gains.v_max),
+        verdict=judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max),
     )
 
 
-def _burst_left(fit: ChannelFit, growth: float, v_r: Floats, w_r: Floats, run: Run) -> float | None:
+def _lifted_radius(n: int, v_r: Floats, w_r: Floats, run: Run, edge: Edge) -> float:
+    gains = run.scenario.controller
+    if edge.predicts and not edge.is_exact:
+        return float(np.exp(floquet.constant_delay(n, v_r, w_r, gains, run.ts, edge) / len(run)))
+    return lifted.largest_radius(0 if edge.is_exact else n, v_r, w_r, edge.felt(gains), run.ts)
+
+
+def _burst_left(fit: ChannelFit, growth: float, v_r: Floats, w_r: Floats, run: Run, edge: Edge) -> float | None:
     """By what factor the mean burst may grow at the fitted loss rate; None for a fit without bursts."""
     if fit.model != "gilbert_elliott" or growth >= 0.0 or fit.chain.loss_rate >= 1.0:
         return None
-    critical = mean_square.critical_burst(
-        fit.chain.loss_rate, v_r, w_r, run.scenario.controller, run.ts, Edge.of(run.scenario)
-    )
+    critical = mean_square.critical_burst(fit.chain.loss_rate, v_r, w_r, run.scenario.controller, run.ts, edge)
     return critical / fit.mean_burst if np.isfinite(critical) else None
 
 
-def _contractions(run: Run) -> tuple[float | None, float | None]:
+def _contractions(run: Run, edge: Edge) -> tuple[float | None, float | None]:
     """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
     first = int(np.argmin(run.lost))
     steps = len(run) - first
@@ -232,12 +234,12 @@ def _contractions(run: Run) -> tuple[float | None, float | None]:
     lost, reference, gains = run.lost[first:], run.reference[first:], run.scenario.controller
     policy = run.scenario.error_detector.policy
     with np.errstate(all="ignore"):
-        of_drops = floquet.drop_sequence(lost, reference[:, 3], reference[:, 4], gains, run.ts, Edge.of(run.scenario))
+        of_drops = floquet.drop_sequence(lost, reference[:, 3], reference[:, 4], gains, run.ts, edge)
         of_drops_per_step = _finite(float(np.exp(of_drops[0] / steps)))
         if policy == "predict":  # whose answers depend on all commands since the pose, not on the pose alone
             return of_drops_per_step, None
-        true = gains_at_true_speed(run.scenario)
-        of_motion = floquet.trajectory(run.pose[first:], reference, lost, true, run.ts, policy == "align")
+        felt = edge.felt(gains)
+        of_motion = floquet.trajectory(run.pose[first:], reference, lost, felt, run.ts, policy == "align")
     return of_drops_per_step, _finite(float(np.exp(of_motion[0] / steps)))
 
 

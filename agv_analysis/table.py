@@ -84,9 +84,7 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
     )
     yield (
         f"Pose always {analysis.n} steps old",
-        "not computed: the edge predicts by a model with another speed than the AGV's"
-        if analysis.lifted_stable is None
-        else _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
+        _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
     )
     yield f"Any outages up to {analysis.n} slots", _bursts(analysis)
     growth = math.exp(analysis.mean_square_growth)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from agv_analysis.analysis import analyse
+from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
-from agv_analysis.stability import bursts, mean_square
+from agv_analysis.stability import bursts, floquet, mean_square
 from agv_analysis.stability.chain import bernoulli
 from agv_analysis.stability.linearisation import HELD, Edge, burst_maps, seen, step_matrices
 from agv_analysis.stability.margins import margins
@@ -75,6 +76,54 @@ def test_the_lap_and_the_operator_agree() -> None:
     speeds[0][-1] = np.nextafter(1.2, 2.0)  # not constant, so that the lap is driven
     growth = mean_square.lap_growth(*speeds, gains, TS, chain, edge=edge)
     assert growth / 400 == pytest.approx(math.log(radius), abs=1e-6)
+
+
+def driven_behind_a_predictor(n: int, F: Floats, G: Floats, delta: float, steps: int) -> Floats:
+    """The error e(k), each prediction made anew from e(k-n) and the commands since; shape (steps, m)."""
+    error, thought = [np.ones(F.shape[-1])], list[Floats]()
+    for k in range(steps):
+        then = max(0, k - n)
+        at_edge = error[then]
+        for j in range(then, k):
+            at_edge = F[j % len(F)] @ at_edge + G[j % len(F)] @ thought[j]
+        thought.append(at_edge)
+        true = G[k % len(F)].copy()
+        true[:, 0] *= 1.0 + delta
+        error.append(F[k % len(F)] @ error[k] + true @ at_edge)
+    return np.array(error)
+
+
+@pytest.mark.parametrize(("n", "delta", "kx"), [(3, 0.5, 60.0), (12, -0.7, 25.0), (12, 1.3, 100.0), (7, 2.2, 150.0)])
+def test_a_constant_delay_behind_a_predictor_with_a_wrong_model(n: int, delta: float, kx: float) -> None:
+    """Against the loop driven with predictions made anew at each step, on a lap whose speeds change all the time."""
+    laps, gains, angle = 60, ControllerParameters(kx=kx, ky=4.0, ktheta=6.0), 2.0 * np.pi * np.arange(50) / 50
+    v_r, w_r = 1.5 + 0.5 * np.sin(angle), 2.0 * np.cos(angle)
+    F, G = step_matrices(v_r, w_r, gains, TS)
+    error = np.linalg.norm(driven_behind_a_predictor(n, F, G, delta, 50 * laps), axis=1)
+    growth = floquet.constant_delay(n, v_r, w_r, gains, TS, Edge(True, delta))
+    peaks = error[1:].reshape(laps, 50).max(axis=1)
+    assert math.log(peaks[-1] / peaks[20]) / (laps - 21) == pytest.approx(growth, rel=0.05, abs=0.02)
+
+
+@pytest.mark.parametrize(("delta", "a"), [(0.5, 0.125), (0.99, 1.0), (1.2, 0.125), (3.0, 0.3)])
+def test_the_longest_delay_behind_a_predictor_along_a_line(delta: float, a: float) -> None:
+    """z^n (z - 1 + a) + a delta: all roots inside the unit circle up to n, not beyond; no bound for |delta| < 1."""
+
+    def radius(n: int) -> float:
+        return (
+            float(np.abs(np.roots([1.0, a - 1.0, *[0.0] * (n - 1), a * delta])).max())
+            if n
+            else abs(1.0 - a - a * delta)
+        )
+
+    found = floquet.largest_constant_delay(
+        np.ones(1), np.zeros(1), ControllerParameters(kx=a / TS), TS, limit=150, edge=Edge(True, delta)
+    )
+    assert (found is None) == (delta < 1.0)
+    if found is None:
+        assert max(radius(n) for n in range(150)) < 1.0
+    else:
+        assert max(radius(n) for n in range(found + 1)) < 1.0 <= radius(found + 1)
 
 
 @pytest.mark.parametrize(("scale", "n", "contracts"), [(1.1, 200, True), (2.1, 15, True), (2.1, 40, False)])

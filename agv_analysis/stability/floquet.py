@@ -4,7 +4,8 @@ The lap is a linear periodic system, so this is the exact answer for its very sp
 criteria at frozen speeds are only indications. Growths are given as natural logarithms, because a lap of 20 000 steps
 shrinks errors by hundreds of powers of ten. The loop is stable if the largest one is below 0.
 
-- `constant_delay`: the pose is n steps old at every step (the lifted system of dimension 3 (n+1), never formed);
+- `constant_delay`: the pose is n steps old at every step (the lifted system of dimension 3 (n+1), never formed), held
+  or moved on by the plant's model;
 - `drop_sequence`: the sequence of losses is given, one verdict a step; between receptions it is held, or predicted;
 - `trajectory`: the same about the motion that was really driven, which may be far from the reference.
 
@@ -40,17 +41,29 @@ _COLUMNS = 4
 
 _LAPS = 40
 
+_LAPS_OF_DELAY = 5
+"""A lap shorter than so many times the delay is driven several times before the subspace is looked at again."""
 
-def constant_delay(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
+
+def constant_delay(
+    n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
+) -> float:
     """Largest growth (logarithm) over a lap of the error, if the pose is always `n` steps old.
 
     Speeds v_r [m/s], w_r [rad/s] of shape (N,). By iterating a subspace of the lifted system over laps until its
     largest Ritz value settles.
     """
-    if is_constant(v_r, w_r):
-        return len(v_r) * math.log(spectral_radius(n, float(v_r[0]), float(w_r[0]), gains, ts))
+    if not edge.predicts:
+        gains = edge.felt(gains)
+        if is_constant(v_r, w_r):
+            return len(v_r) * math.log(spectral_radius(n, float(v_r[0]), float(w_r[0]), gains, ts))
     size = reachable(v_r, w_r)
     F, G = (np.ascontiguousarray(M[:, :size, :size]) for M in step_matrices(v_r, w_r, gains, ts))
+    if edge.predicts:
+        F, G = predicted_delay(n, F, G, edge.delta)
+    laps = math.ceil(_LAPS_OF_DELAY * (n + 1) / len(v_r))
+    if laps > 1:
+        F, G = np.tile(F, (laps, 1, 1)), np.tile(G, (laps, 1, 1))
     columns = min(_COLUMNS, size * (n + 1))
     window = np.random.default_rng(0).standard_normal((n + 1, size, columns))
     growth = math.nan
@@ -62,11 +75,32 @@ def constant_delay(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters
         before, growth = growth, log_scale + math.log(ritz) if ritz > 0.0 else -math.inf
         if growth == before or abs(growth - before) <= 1e-10 * max(1.0, abs(growth)):
             break
-    return growth
+    return growth / laps
+
+
+def predicted_delay(n: int, F: Floats, G: Floats, delta: float) -> tuple[Floats, Floats]:
+    """F' and G' of h(k+1) = F'(k) h(k) + G'(k) h(k-n): the predicted error h, if the pose is always `n` steps old.
+
+    The edge moves the pose on under the commands that it sent, which it computed from earlier predictions. What it does
+    not know is the plant's share D = G_true - G of them: h(k) = e(k) - sum_{j=k-n}^{k-1} F(k-1) ... F(j+1) D(j) h(j).
+    Together with e(k+1) = F(k) e(k) + (G + D)(k) h(k) the sum telescopes to
+
+        h(k+1) = (F + G)(k) h(k) + F(k) ... F(k-n+1) D(k-n) h(k-n)
+
+    so an exact model leaves the loop without outages, and along a straight track, where F = 1 and D = -a delta, every
+    delay is survived as long as |delta| < 1 and a <= 1. Rows of F and G, shape (N, m, m), are the steps of a lap.
+    """
+    steps = np.arange(len(F))
+    unknown = delta * G[(steps - n) % len(F), :, 0]
+    for i in range(n):
+        unknown = np.einsum("kij,kj->ki", F[(steps - n + 1 + i) % len(F)], unknown)
+    delayed = np.zeros_like(G)
+    delayed[:, :, 0] = unknown
+    return F + G, delayed
 
 
 def largest_constant_delay(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 10_000
+    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 10_000, edge: Edge = HELD
 ) -> int | None:
     """Largest constant n for which the lap contracts the error; -1 if not even 0 does, None if all up to `limit` do.
 
@@ -74,10 +108,10 @@ def largest_constant_delay(
     """
 
     def contracts(n: int) -> bool:
-        return constant_delay(n, v_r, w_r, gains, ts) < MARGINAL * len(v_r)
+        return constant_delay(n, v_r, w_r, gains, ts, edge) < MARGINAL * len(v_r)
 
-    mean = float(np.abs(v_r).mean())
-    guess = min(critical_delay_along(ts * gains.kx), critical_delay_across(mean, gains, ts), limit)
+    mean, a = float(np.abs(v_r).mean()), ts * edge.felt(gains).kx
+    guess = 0.0 if edge.predicts else min(critical_delay_along(a), critical_delay_across(mean, gains, ts), limit)
     stable, step = math.ceil(guess) - 1, 1
     while stable >= 0 and not contracts(stable):
         stable, step = max(-1, stable - step), 2 * step

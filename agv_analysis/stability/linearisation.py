@@ -23,6 +23,7 @@ column of K_x in G, but not in the H of a predictor, whose model does not know o
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -62,6 +63,10 @@ class Edge(NamedTuple):
     def is_exact(self) -> bool:
         """Does the edge know the error as well as if no pose were lost?"""
         return self.predicts and self.delta == 0.0
+
+    def felt(self, gains: ControllerParameters) -> ControllerParameters:
+        """The gains as the plant feels them: K_x times true over commanded speed."""
+        return dataclasses.replace(gains, kx=gains.kx * (1.0 + self.delta))
 
     @classmethod
     def of(cls, scenario: Scenario) -> Edge:

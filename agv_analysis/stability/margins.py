@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,8 +21,8 @@ ALONG, ACROSS = "along", "across"
 LONGEST, LONGEST_PREDICTED = 1000, 200
 """Longest bursts [slots] that are tried; fewer behind a predictor, where nothing ends the search early."""
 
-LONGEST_DELAY = 10_000
-"""Longest constant delay [steps] that is tried."""
+LONGEST_DELAY, LONGEST_DELAY_PREDICTED = 10_000, 1000
+"""Longest constant delay [steps] that is tried; shorter behind a predictor, where each takes longer."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +123,9 @@ def margins(scenario: Scenario) -> Margins:
         reasons["n_max.paper"] = (
             "no bound: the test holds for every n, since it sees an outdated pose only by how far it has turned"
         )
-    edge, true = Edge.of(scenario), gains_at_true_speed(scenario)
-    n_lifted = _largest_constant_delay(v_r, w_r, true, ts, edge, reasons)
+    edge = Edge.of(scenario)
+    true = edge.felt(gains)
+    n_lifted = _largest_constant_delay(v_r, w_r, gains, ts, edge, reasons)
     longest = LONGEST_PREDICTED if edge.predicts else LONGEST
     n_bursts, refuted = bursts.largest_n(v_r, w_r, gains, ts, longest, edge)
     if n_bursts is None:
@@ -163,24 +163,16 @@ def margins(scenario: Scenario) -> Margins:
     )
 
 
-def gains_at_true_speed(scenario: Scenario) -> ControllerParameters:
-    """The gains as the plant feels them: K_x times true over commanded speed."""
-    return dataclasses.replace(scenario.controller, kx=scenario.controller.kx * scenario.plant.speed_scale)
-
-
 def _largest_constant_delay(
     v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge, reasons: dict[str, str]
 ) -> int | None:
-    name = "n_max.lifted"
-    if edge.predicts and not edge.is_exact:
-        reasons[name] = "no answer: a constant delay behind a predictor with a wrong model is not computed"
-        return None
-    found = floquet.largest_constant_delay(v_r, w_r, gains, ts, 0 if edge.is_exact else LONGEST_DELAY)
+    limit = 0 if edge.is_exact else LONGEST_DELAY_PREDICTED if edge.predicts else LONGEST_DELAY
+    found = floquet.largest_constant_delay(v_r, w_r, gains, ts, limit, edge)
     if found is None:
-        reasons[name] = (
+        reasons["n_max.lifted"] = (
             "no bound: an exact prediction is as good as a fresh pose"
             if edge.is_exact
-            else f"no bound: the lap contracts for every n that was tried, up to {LONGEST_DELAY}"
+            else f"no bound: the lap contracts for every n that was tried, up to {limit}"
         )
     return found
 
