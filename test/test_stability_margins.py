@@ -117,7 +117,7 @@ def test_the_command(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) ->
 
 def test_a_trace_has_no_best_gain_and_says_why(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     trace, path = tmp_path / "lost.csv", tmp_path / "margins.json"
-    trace.write_text("1\n0\n1\n")
+    trace.write_text("lost\n1\n0\n1\n")
     settings = ("error_detector.track=line", "relay.uplink.model=trace", f"relay.uplink.trace_file={trace}")
     status, said = agv_ncs(
         "stability", "config/paper.yaml", *(word for setting in settings for word in ("--set", setting)), "--json", path

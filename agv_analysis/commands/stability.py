@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +14,18 @@ from agv_analysis.commands import with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.scenario import Scenario
+    from agv_analysis.stability.empirical import Twins
     from agv_analysis.stability.margins import Margins
+
+
+_POLICIES = {
+    "hold": "held (error_detector.policy is hold)",
+    "align": "held, and compared with the reference of its own time (error_detector.policy is align)",
+    "predict": "moved on by the plant's model (error_detector.policy is predict)",
+}
+
+_SEEDS = 20
+"""Runs under the scenario's channel that the criteria are held against."""
 
 
 @click.command("stability")
@@ -56,10 +69,12 @@ def command(
     console = Console(highlight=False)
     with Console(stderr=True).status("computing the margins ..."):
         found = margins(scenario)
+        twins, seeds = _twins(scenario)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
-    for name, value in rows(found, scenario.plant.ts):
+    table.add_row("An outdated pose is", _POLICIES[scenario.error_detector.policy])
+    for name, value in (*rows(found, scenario.plant.ts), ("Twins of this scenario, simulated", _told(twins, seeds))):
         table.add_row(name, value)
     console.print(table)
     best, reasons = _best_gains(scenario)
@@ -70,10 +85,30 @@ def command(
         console.print(f"Best K_x: {reasons['best_kx']}")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
+    if found.left_out:
+        console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
         told = {f"{name}_reason": reason for name, reason in reasons.items()}
         gains = {"best_kx": {**best, **told}} if best else {"best_kx": None, **told}
-        write_json(json_file, {**found.to_json(), **gains})
+        write_json(json_file, {**found.to_json(), "empirical": twins.to_json(), **gains})
+
+
+def _twins(scenario: Scenario) -> tuple[Twins, range]:
+    """Twins of one lap of the scenario, or of all of it where it has an end, under several seeds."""
+    from agv_analysis.stability.empirical import simulated_twins
+    from agv_cloud.reference import lap_steps
+
+    if not math.isfinite(scenario.plant.duration):
+        lap = lap_steps(scenario.error_detector) * scenario.plant.ts
+        scenario = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, duration=lap))
+    seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
+    return simulated_twins(scenario, seeds), seeds
+
+
+def _told(twins: Twins, seeds: range) -> str:
+    """What twins did, in words."""
+    runs = f"{twins.contracting} of {len(seeds)} runs contract (seeds {seeds[0]} to {seeds[-1]})"
+    return f"{runs}, the median to {twins.median:.2g}" if math.isfinite(twins.median) else f"{runs}; the others diverge"
 
 
 def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:

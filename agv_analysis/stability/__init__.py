@@ -1,13 +1,13 @@
-"""Is the loop stable under outages? Five answers, one module each, because they answer different questions.
+"""Is the loop stable under outages? Six answers, one module each, because they answer different questions.
 
     paper        |lambda| < 1 for A(k) at every step: blind to outages on a straight track
     lifted       the pose is n steps old at every step, speeds frozen: a delay; over a lap that turns: `floquet`
     bursts       up to n losses in a row, in any order, for ever: a joint spectral radius, bounded from both sides
     mean_square  random losses, E[|e|^2] dies out: a Markov jump linear system; `almost_sure`: almost every run does
     floquet      one lap, or one recorded sequence of losses, again and again: what that very lap does
+    empirical    twins that begin apart and meet the same losses: do they come together?
 
-The empirical answer, twins that start apart and meet the same losses, is `agv_analysis.simulation`'s
-(`simulate_batch(..., twins=True)`). All but the paper's start from `linearisation`: e(k+1) = F(k) e(k) + G(k) e(k-n).
+All but the first and the last start from `linearisation`: e(k+1) = F(k) e(k) + G(k) e(k-n).
 
 What counts as stable is the same everywhere: a small error dies out over the lap. A parked AGV cannot move sideways or
 turn, so the error across the track is neutral while it stands. Criteria at frozen speeds therefore leave neutral

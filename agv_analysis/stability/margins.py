@@ -15,6 +15,8 @@ from agv_analysis.stability.chain import chain_of
 from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference import Reference, lap_steps
+from agv_plant.parameters import PlantParameters
+from agv_ros.parameters import SHARED, as_dict
 
 ALONG, ACROSS = "along", "across"
 
@@ -23,6 +25,14 @@ LONGEST, LONGEST_PREDICTED = 1000, 200
 
 LONGEST_DELAY, LONGEST_DELAY_PREDICTED = 10_000, 1000
 """Longest constant delay [steps] that is tried; shorter behind a predictor, where each takes longer."""
+
+
+_KNOWN_TO_CRITERIA = {
+    *(f"plant.{name}" for name in SHARED),
+    *(f"plant.{name}" for name in ("initial_pose", "integration", "clock", "duration", "speed_scale")),
+    *(f"plant.{name}" for name in ("answer_timeout", "cmd_vel_timeout", "downlink_policy", "ramp_time")),
+}
+"""Parameters of the plant that criteria ask for, that do not matter to them, or only where commands are lost."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,8 @@ class Margins:
     """Which error the bursts blow up first: `along` the track or `across` it."""
     reasons: dict[str, str] = field(default_factory=dict)
     """Why a margin is None, by its name in `to_json`."""
+    left_out: tuple[str, ...] = ()
+    """What the scenario has and these margins do not know."""
 
     def disagreements(self) -> list[str]:
         """A sentence for each pair of criteria that say different things."""
@@ -101,6 +113,7 @@ class Margins:
             "delay_margin": self.delay,
             "loss_rate": self.loss_rate,
             "binding": self.binding,
+            "left_out": list(self.left_out),
             "disagreements": self.disagreements(),
         }
 
@@ -160,7 +173,18 @@ def margins(scenario: Scenario) -> Margins:
         delay=None if edge.predicts else _delay(float(np.abs(v_r).max()), true, ts),
         binding=_binding_of(edge, n_bursts, float(np.abs(v_r).max()), true, ts),
         reasons=reasons,
+        left_out=left_out(scenario),
     )
+
+
+def left_out(scenario: Scenario) -> tuple[str, ...]:
+    """What a scenario has and no criterion but the empirical one knows, each as `node.parameter is value`."""
+    values = {f"plant.{name}": value for name, value in as_dict(scenario.plant).items()}
+    usual = {f"plant.{name}": value for name, value in as_dict(PlantParameters()).items()}
+    found = [name for name in values if name not in _KNOWN_TO_CRITERIA and values[name] != usual[name]]
+    downlink = scenario.relay.downlink.model
+    lossy = [] if downlink == "perfect" else [f"relay.downlink.model is {downlink}"]
+    return (*lossy, *(f"{name} is {values[name]}" for name in found))
 
 
 def _largest_constant_delay(

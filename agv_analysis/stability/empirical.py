@@ -1,0 +1,62 @@
+"""The empirical criterion: twins that begin apart, meet the same losses, and come together or not.
+
+No theory goes in, so it is the judge of all others, and it knows what they leave out: the nonlinear loop far from its
+reference, limits on speed, the downlink's losses, an actuator that lags. What it says holds for the runs that were
+driven and no others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.run import Floats, Run
+from agv_analysis.scenario import Scenario
+from agv_analysis.simulation import simulate_batch
+from agv_ros.errors import UserError
+
+
+@dataclass(frozen=True)
+class Twins:
+    """Distances of twins in (x, y, theta) [m, m, rad] at the end of a run, as multiples of those at its beginning."""
+
+    contraction: Floats
+    """One value a run, shape (runs,); inf if the loop left the range of numbers."""
+
+    @property
+    def contracting(self) -> int:
+        """Number of runs whose twins ended closer to each other than they began."""
+        return int(np.count_nonzero(self.contraction < 1.0))
+
+    @property
+    def median(self) -> float:
+        """The contraction that half of the runs reach."""
+        return float(np.median(self.contraction))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; JSON has no infinity."""
+        median = self.median if math.isfinite(self.median) else None
+        return {"runs": len(self.contraction), "contracting": self.contracting, "median_contraction": median}
+
+
+def simulated_twins(scenario: Scenario, seeds: Sequence[int]) -> Twins:
+    """Twins of a scenario under each seed, a micrometre and a microradian apart at first, by simulation.
+
+    A contraction of 1e-9 or so is rounding: they have met. Raises UserError if the run has no end.
+    """
+    return Twins(simulate_batch([scenario], seeds, twins=True)["contraction"][0])
+
+
+def distances(run: Run, twin: Run) -> Floats:
+    """Distance of two recorded runs in (x, y, theta) [m, m, rad] at each step, shape (N,).
+
+    Raises UserError unless both have the same steps and met the same losses on both links.
+    """
+    for name in ("k", "lost", "downlink_lost"):
+        if not np.array_equal(getattr(run, name), getattr(twin, name)):
+            raise UserError(f"{run.source} and {twin.source} are no twins: they differ in {name}")
+    return np.asarray(np.linalg.norm(run.pose - twin.pose, axis=1))
