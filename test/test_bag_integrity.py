@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import random
+import shutil
+import sqlite3
 import struct
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,9 +20,13 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from agv_analysis.bags import Bag, BagError, read_bag
+from agv_analysis.bags import Bag, BagError, mcap_file, read_bag, rosbags_file
+from agv_analysis.bags import bag as bag_module
+from agv_analysis.bags.chunk import sort_out, walk
 from agv_analysis.bags.recover import recover
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -105,8 +113,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "none without CRC": {"compression": CompressionType.NONE, "enable_crcs": False},
     "unchunked": {"use_chunking": False},
     "unchunked with CRC": {"use_chunking": False, "enable_data_crcs": True},
+    "zstd, compiled": {"compression": CompressionType.ZSTD},
+    "none without CRC, compiled": {"compression": CompressionType.NONE, "enable_crcs": False},
 }
-PROVEN = ("zstd", "lz4", "none")
+"""Those that are `compiled` are read by the code that reads large files."""
+
+PROVEN = ("zstd", "lz4", "none", "zstd, compiled")
 
 
 def places_of(kind: str) -> int:
@@ -115,8 +127,12 @@ def places_of(kind: str) -> int:
 
 
 @pytest.fixture(scope="module", params=OPTIONS)
-def kind(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+def kind(request: pytest.FixtureRequest) -> Iterator[str]:
+    with pytest.MonkeyPatch.context() as patch:
+        if "compiled" in request.param:
+            for module in (bag_module, mcap_file):
+                patch.setattr(module, "LARGE", 0)
+        yield str(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -299,14 +315,37 @@ def test_a_file_by_hand_is_read(read: Callable[[bytes], Bag]) -> None:
     assert bag.is_complete
 
 
-def test_a_decompression_bomb_is_left_alone(read: Callable[[bytes], Bag]) -> None:
-    bomb = zstandard.ZstdCompressor().compress(bytes(2**28))
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_decompression_bomb_is_left_alone(read: Callable[[bytes], Bag], compression: str) -> None:
+    compress = zstandard.ZstdCompressor().compress if compression == "zstd" else lz4.frame.compress
+    bomb, whole = compress(bytes(2**28)), HEAD + STRING + CHANNEL + message(1)
     for declared in (10, 2**20, 2**40, 2**64 - 1):
-        packed = struct.pack("<QQQI", 0, 0, declared, 0) + text("zstd") + struct.pack("<Q", len(bomb)) + bomb
-        bag = read(HEAD + STRING + CHANNEL + message(1) + record(6, packed) + message(2) + END)
+        packed = struct.pack("<QQQI", 0, 0, declared, 0) + text(compression) + struct.pack("<Q", len(bomb)) + bomb
+        with little_memory(2**26):
+            bag = read(whole + 5 * record(6, packed) + message(2) + END)
         assert bag["/text"]["log_time_ns"].tolist() == [1, 2]
         assert "damaged chunk, left out" in " ".join(bag.problems)
         assert not bag.is_complete
+
+
+@contextlib.contextmanager
+def little_memory(limit: int) -> Iterator[None]:
+    """Hold the bytes that Python and numpy take in here, at their most, against a limit."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_goes_with_the_largest_chunks_not_with_the_file(tmp_path: Path) -> None:
+    """64 chunks of 4 MiB, whose messages nobody asks for."""
+    packed = chunk(message(1, "x" * 2**22), compression="zstd")
+    (tmp_path / "a.mcap").write_bytes(HEAD + STRING + CHANNEL + 64 * packed + END)
+    with little_memory(2**26):
+        bag = read_bag(tmp_path / "a.mcap", topics=())
+    assert bag.topics["/text"].count == 64
 
 
 @pytest.mark.parametrize("length", [2**63, 2**64 - 1, 2**40, 10**6])
@@ -333,14 +372,20 @@ def test_hostile_lengths_inside_records(read: Callable[[bytes], Bag]) -> None:
         assert not bag.is_complete
 
 
-def test_a_message_index_is_not_believed(read: Callable[[bytes], Bag]) -> None:
+@pytest.mark.parametrize("large", [2**24, 0])
+def test_a_message_index_is_not_believed(
+    read: Callable[[bytes], Bag], monkeypatch: pytest.MonkeyPatch, large: int
+) -> None:
+    monkeypatch.setattr(mcap_file, "LARGE", large)
     content = message(1) + message(2) + message(3)
-    size = len(message(1))
-    for places in ([0, 2 * size], [0, size, 2 * size, 0], [0, size, 7], [0, size, 2**63], [], [2 * size, size, 0]):
+    size, useless = len(message(1)), "message index that does not fit its chunk, not used"
+    for places in ([0, size, 2 * size], [2 * size, size, 0], [0, 2 * size], [0, size, 2 * size, 0], [0, size, 7],
+                   [0, size, 2**63], []):  # fmt: skip
         entries = b"".join(struct.pack("<QQ", 0, place) for place in places)
         index = record(7, struct.pack("<HI", 1, len(entries)) + entries)
         bag = read(HEAD + STRING + CHANNEL + chunk(content) + index + END)
         assert bag["/text"]["log_time_ns"].tolist() == [1, 2, 3]
+        assert any(useless in problem for problem in bag.problems) == (sorted(places) != [0, size, 2 * size])
 
 
 def test_a_damaged_message_in_an_unchecked_chunk_costs_itself_alone(read: Callable[[bytes], Bag]) -> None:
@@ -362,6 +407,24 @@ def test_a_schema_that_lies(read: Callable[[bytes], Bag]) -> None:
     few = read(HEAD + lie + CHANNEL + message(1) + END)
     assert len(few["/text"]) == 0
     assert not few.is_complete
+
+
+@pytest.mark.parametrize(
+    ("said", "is_found"),
+    [("float64 x\nfloat64 y", False), ("float64 y\nfloat64 x", True), ("int64 x\nfloat64 y", True), ("", False)],
+)
+def test_a_schema_whose_lie_fits_the_bytes_has_another_hash(
+    read: Callable[[bytes], Bag], said: str, is_found: bool
+) -> None:
+    """The hash is that of x before y, taken from rosbags' own types; without a hash nobody can know."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg("float64 x\nfloat64 y", "a/msg/A"))
+    about = text("topic_type_hash") + text(store.hash_rihs01("a/msg/A") if said else "")
+    schema = record(3, struct.pack("<H", 1) + text("a/msg/A") + text("ros2msg") + text(said or "float64 y\nfloat64 x"))
+    channel = record(4, struct.pack("<HH", 1, 1) + text("/a") + text("cdr") + struct.pack("<I", len(about)) + about)
+    sent = record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + b"\0\1\0\0" + struct.pack("<dd", 1.0, 2.0))
+    bag = read(HEAD + schema + channel + sent + END)
+    assert any("not the hash recorded with it" in problem for problem in bag.problems) == is_found
 
 
 def test_messages_without_a_channel_are_counted(read: Callable[[bytes], Bag]) -> None:
@@ -387,6 +450,128 @@ def test_a_topic_that_is_defined_in_two_ways(read: Callable[[bytes], Bag]) -> No
     assert "channel 1 defined in two ways, the first is used: 1" in bag.problems
 
 
+def test_values_that_are_not_numbers_stay_what_they_are(read: Callable[[bytes], Bag]) -> None:
+    """A stamp that is NaN, and two messages that only a NaN's bits tell apart, or nothing does."""
+    schema = record(3, struct.pack("<H", 1) + text("a/msg/A") + text("ros2msg") + text("float64 stamp"))
+    channel = record(4, struct.pack("<HH", 1, 1) + text("/a") + text("cdr") + struct.pack("<I", 0))
+    quiet, other = 0x7FF8000000000000, 0x7FF8000000000001
+    sent = [
+        record(5, struct.pack("<HIQQ", 1, 0, 7, 7) + b"\0\1\0\0" + struct.pack("<Q", bits))
+        for bits in (quiet, quiet, other)
+    ]
+    bag = read(HEAD + schema + channel + b"".join(sent) + END)
+    assert bag["/a"]["stamp"].view(np.uint64).tolist() == [quiet, quiet, other]
+    assert "/a: message that is there twice: 1" in bag.problems
+
+
+def test_another_magic(read: Callable[[bytes], Bag]) -> None:
+    """Before sound records it is said; before anything else the file is refused."""
+    whole = write()
+    for magic in (b"\x89MCAP1\r\n", b"#ROSBAG ", bytes(8)):
+        bag = read(magic + whole[8:])
+        assert rows_of(bag) == expected_rows()
+        assert any("instead of 89 4d 43 41 50 30 0d 0a" in problem for problem in bag.problems)
+    for content in (b"#ROSBAG V2.0\n" + bytes(100), b"SQLite format 3\0" + bytes(100), whole[9:]):
+        with pytest.raises(BagError, match="is no MCAP file: begins with"):
+            read(content)
+
+
+# -- sqlite3 -----------------------------------------------------------------------------------------------------------
+
+
+def database(path: Path, compression: CompressionMode = CompressionMode.NONE) -> Path:
+    """The small loop as a rosbag2 directory with a sqlite3 database."""
+    writer = Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    if compression != CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    connections: dict[str, Any] = {}
+    with writer:
+        for ns, topic, content in _messages():
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, content.__msgtype__, typestore=STORE)
+            writer.write(connections[topic], ns, bytes(STORE.serialize_cdr(content, content.__msgtype__)))
+    return next(path.glob("*.db3"))
+
+
+def change(path: Path, *statements: str) -> None:
+    """Change a database."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+        connection.commit()
+
+
+def test_a_database_that_was_cut_or_flipped_is_read_or_refused(tmp_path: Path) -> None:
+    whole, damaged = database(tmp_path / "bag").read_bytes(), tmp_path / "damaged.db3"
+    draw = random.Random(5)
+    for number in range(300):
+        data = bytearray(whole[: draw.randrange(len(whole))] if number % 3 == 0 else whole)
+        for _ in range(number % 3 and draw.choice([1, 1, 30])):
+            data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+        damaged.write_bytes(data)
+        try:
+            bag = read_bag(damaged)
+        except BagError:
+            continue
+        assert "storage without checksums, whose content is not checked: 1" in bag.problems
+        if bag.is_complete:
+            assert sum(topic.count for topic in bag.topics.values()) == len(_messages()), number
+
+
+def test_what_is_missing_in_a_database_is_said(tmp_path: Path) -> None:
+    path = database(tmp_path / "bag")
+    change(path, "DELETE FROM messages WHERE id IN (5, 6, 90)")
+    bag = read_bag(path)
+    assert f"{path.name}: message missing from the sequence of its numbers: 3" in bag.problems
+    assert not bag.is_complete
+
+
+def test_rows_of_a_database_that_are_no_messages_cost_themselves_alone(tmp_path: Path) -> None:
+    path = tmp_path / "bag.db3"
+    shutil.copy(database(tmp_path / "bag"), path)
+    change(
+        path,
+        "CREATE TABLE free AS SELECT * FROM messages", "DROP TABLE messages", "ALTER TABLE free RENAME TO messages",
+        "UPDATE messages SET data = NULL WHERE id = 4", "UPDATE messages SET timestamp = 'noon' WHERE id = 7",
+        "UPDATE messages SET data = x'' WHERE id = 10",
+    )  # fmt: skip
+    bag = read_bag(path)
+    assert not bag.is_complete
+    assert len(bag["/agv/pose"]) == len(bag["/edge/slot"]) == STEPS
+    assert len(bag["/clock"]) == STEPS - 3
+    assert "/clock: row that is no message, left out: 2" in bag.problems
+
+
+def test_a_database_that_was_still_being_written(tmp_path: Path) -> None:
+    path = database(tmp_path / "bag")
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, 5, x'00')")
+        connection.commit()
+        for file in (path, path.with_name(f"{path.name}-wal")):
+            shutil.copy(file, tmp_path)  # as a power cut leaves them
+    bag = read_bag(tmp_path / path.name)
+    assert any("its messages are not read" in problem for problem in bag.problems)
+    assert not bag.is_complete
+
+
+def test_a_bomb_among_messages_that_are_compressed_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rosbags_file, "MAX_MESSAGE", 2**23)
+    path = database(tmp_path / "bag", CompressionMode.MESSAGE)
+    bombs = [zstandard.ZstdCompressor().compress(bytes(2**28))]
+    stream = zstandard.ZstdCompressor().compressobj()  # does not say how much it is
+    bombs.append(stream.compress(bytes(2**28)) + stream.flush())
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        for row, bomb in zip((1, 4), bombs, strict=True):
+            connection.execute("UPDATE messages SET data = ? WHERE id = ?", (bomb, row))
+        connection.commit()
+    with little_memory(2**26):
+        bag = read_bag(path.parent)
+    assert len(bag["/clock"]) == STEPS - 2
+    assert len(bag["/agv/pose"]) == len(bag["/edge/slot"]) == STEPS
+    assert not bag.is_complete
+
+
 # -- recovered --------------------------------------------------------------------------------------------------------
 
 
@@ -410,6 +595,20 @@ def test_a_recovered_bag_is_clean_and_holds_what_could_be_read(truth: Truth, tmp
 # -- at random --------------------------------------------------------------------------------------------------------
 
 
+def _contents() -> st.SearchStrategy[bytes]:
+    """Contents of chunks: messages of several channels, as a rule, and perhaps something else, or a byte changed."""
+    sent = st.builds(message, st.integers(0, 2**64 - 1), st.text(max_size=5), st.sampled_from([1, 2, 300, 65535]))
+    parts = st.lists(st.one_of(sent, sent, sent, st.sampled_from([STRING, CHANNEL, b"\5", bytes(40)])), max_size=12)
+
+    def changed(parts: list[bytes], at: int, byte: int) -> bytes:
+        data = bytearray(b"".join(parts))
+        if at < len(data):
+            data[at] = byte
+        return bytes(data)
+
+    return st.builds(changed, parts, st.integers(0, 1000), st.integers(0, 255))
+
+
 def _mutations() -> st.SearchStrategy[bytes]:
     """Bags to which something was done: bytes replaced, taken out, put in, repeated."""
     bases = [write(**options)[:3000] + write(**options)[-1500:] for options in OPTIONS.values()]
@@ -430,6 +629,19 @@ def _mutations() -> st.SearchStrategy[bytes]:
         return bytes(data)
 
     return st.builds(apply, st.sampled_from(bases), st.lists(edit, max_size=6))
+
+
+@given(_contents())
+@settings(max_examples=300, deadline=None, derandomize=True)
+def test_the_compiled_survey_is_the_walk_from_record_to_record(content: bytes) -> None:
+    """Or leaves it to that, where there is anything else than messages."""
+    found, is_named = sort_out(content, [], is_large=True)
+    expected = walk(content)
+    assert (found.lost, found.definitions, is_named) == (expected.lost, expected.definitions, False)
+    assert found.messages.keys() == expected.messages.keys()
+    for channel, messages in expected.messages.items():
+        assert found.messages[channel].starts.tolist() == messages.starts.tolist()
+        assert found.messages[channel].lengths.tolist() == messages.lengths.tolist()
 
 
 @given(_mutations())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,14 +15,15 @@ from agv_analysis.bags.batch import Batch
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.errors import BagError, UndecodableError
 from agv_analysis.bags.findings import Findings
-from agv_analysis.bags.records import Channel, Schema
+from agv_analysis.bags.records import TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
 from agv_analysis.bags.schema import parse_schema
-from agv_analysis.bags.storage import Storage
+from agv_analysis.bags.storage import LARGE, Storage
 from agv_analysis.bags.table import Table
+from agv_analysis.bags.type_hash import contradicts
 
-_LARGE = 2**24
-"""Files of more bytes than this are decoded by compiled code."""
+_THREADS = 2
+"""So many topics are checked at a time."""
 
 Progress = Callable[[int], None]
 """Called with the share of a bag that has been read [%], every now and then."""
@@ -123,6 +125,7 @@ class _Reading:
         self._refusals: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
         self._metadata: dict[str, dict[str, str]] = {}
+        self._latest: dict[int, tuple[Channel, Schema | None, Table | None]] = {}
 
     def is_wanted(self, channel: Channel) -> bool:
         """Are the messages of this channel to become an array?"""
@@ -130,7 +133,11 @@ class _Reading:
 
     def take(self, storage: Storage, channel: Channel, batch: Batch) -> None:
         """Add a batch to the table of its topic; a topic that cannot be decoded is given up."""
-        table = self._table(storage, channel)
+        schema = storage.schemas.get(channel.schema_id)
+        latest = self._latest.get(channel.id)
+        if latest is None or latest[0] is not channel or latest[1] is not schema:
+            latest = self._latest[channel.id] = channel, schema, self._table(storage, channel)
+        table = latest[2]
         if table is not None:
             try:
                 table.append(batch)
@@ -162,7 +169,10 @@ class _Reading:
                 raise UndecodableError(f"it has messages of two types, {first.name} and {schema.name}")
             if topic not in self._tables:
                 kind = parse_schema(schema.name, schema.encoding, schema.text)
-                self._tables[topic] = Table(kind, storage.expected(channel.id), storage.size > _LARGE)
+                if contradicts(schema.name, schema.text, channel.metadata.get(TYPE_HASH, "")):
+                    what = "definition of its type that has not the hash recorded with it, so that values may be wrong"
+                    self._findings.add(f"{topic}: {what}")
+                self._tables[topic] = Table(kind, storage.expected(channel.id), storage.size > LARGE)
         except UndecodableError as error:
             self._refuse(topic, error)
         return self._tables.get(topic)
@@ -180,7 +190,9 @@ class _Reading:
             if table.layouts.misfits:
                 what = f"{topic}: message that is not of its type, left out ({table.layouts.first_misfit})"
                 self._findings.add(what, table.layouts.misfits, is_loss=True)
-            check_times(topic, arrays[topic], self._findings)
+        with ThreadPoolExecutor(_THREADS, "bag") as pool:
+            for found in pool.map(check_times, arrays, arrays.values()):
+                self._findings.merge(found)
         for topic, reason in sorted(self._refusals.items()):
             self._findings.add(f"{topic}: topic that {reason}")
         topics = {name: self._topic(name) for name in sorted(self._known)}

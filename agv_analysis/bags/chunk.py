@@ -8,13 +8,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Bytes, Ints, numbers_at
 from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
 from agv_analysis.bags.errors import DamagedError
-from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Read, has_shape, is_known
+from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Index, Read, has_shape, is_known
+from agv_analysis.bags.survey import survey
 
 _HEAD = 8 + 8 + 8 + 4
 """Bytes of a chunk record before the name of its compression."""
@@ -27,8 +27,6 @@ class Messages(NamedTuple):
     """Where their records begin, shape (n,)."""
     lengths: Ints
     """Lengths of their records' contents, shape (n,)."""
-    channels: NDArray[np.uint16]
-    """Their channels, shape (n,)."""
 
 
 class Definition(NamedTuple):
@@ -135,16 +133,38 @@ def cut_chunk(length: int, left: int, read: Read) -> bytes | None:
 # -- from the content to its messages ---------------------------------------------------------------------------------
 
 
-def find(content: bytes, index: list[Ints]) -> Content | None:
+def sort_out(content: bytes, indexes: list[Index], is_large: bool) -> tuple[Content, bool]:
+    """Messages of a chunk, and whether its message indexes name exactly these; `is_large`: compiled code pays."""
+    if is_large and (found := survey(content)) is not None:
+        bounds = [0, *found.ends.tolist()]
+        messages = {
+            channel: Messages(found.starts[begin:end], found.lengths[begin:end])
+            for channel, (begin, end) in enumerate(pairwise(bounds))
+            if end > begin
+        }
+        return Content(messages, [], 0), _is_named(found.starts, indexes)
+    content_by_index = find(content, [index.places for index in indexes])
+    return content_by_index or walk(content), content_by_index is not None
+
+
+def _is_named(starts: Ints, indexes: list[Index]) -> bool:
+    """Do the message indexes name exactly these messages, which are given channel by channel?"""
+    if sum(len(index.places) for index in indexes) != len(starts):
+        return False
+    places = np.concatenate([index.places for index in sorted(indexes, key=lambda index: index.channel)])
+    return np.array_equal(places, starts) or np.array_equal(np.sort(places), np.sort(starts))
+
+
+def find(content: bytes, places: list[Ints]) -> Content | None:
     """Messages of a chunk at the places that its message indexes name; None if these are not exactly its messages.
 
     The index is a hint and nothing more: its places must be those of message records, and together with records of
     other kinds they must fill the chunk without gap or overlap.
     """
-    if not sum(map(len, index)):
+    if not sum(map(len, places)):
         return None
     buffer = np.frombuffer(content, np.uint8)
-    starts = np.sort(np.concatenate(index))
+    starts = np.sort(np.concatenate(places))
     if starts[0] < 0 or starts[-1] > len(content) - RECORD.size - MESSAGE_HEAD:
         return None
     messages = messages_at(buffer, starts)
@@ -158,7 +178,7 @@ def find(content: bytes, index: list[Ints]) -> Content | None:
         if found is None:
             return None
         definitions += found
-    return Content(by_channel(messages), definitions, 0)
+    return Content(by_channel(buffer, messages), definitions, 0)
 
 
 def _definitions(content: bytes, position: int, end: int) -> list[Definition] | None:
@@ -198,8 +218,8 @@ def walk(content: bytes, is_cut: bool = False) -> Content:
             position = starts.pop()
         lost += after - position
         position = after
-    messages = messages_at(np.frombuffer(content, np.uint8), np.array(starts, np.int64))
-    return Content(by_channel(messages), definitions, lost)
+    buffer = np.frombuffer(content, np.uint8)
+    return Content(by_channel(buffer, messages_at(buffer, np.array(starts, np.int64))), definitions, lost)
 
 
 def run_of_messages(content: bytes, position: int) -> tuple[list[int], int]:
@@ -266,20 +286,15 @@ def is_wrong_length(start: int, end: int, after: int) -> bool:
 
 def messages_at(buffer: Bytes, starts: Ints) -> Messages:
     """The messages whose records begin at `starts`."""
-    if not len(starts):
-        return Messages(starts, starts, np.empty(0, np.uint16))
-    lengths = numbers_at(buffer, starts + 1, "<i8")
-    return Messages(starts, lengths, numbers_at(buffer, starts + RECORD.size, "<u2"))
+    return Messages(starts, numbers_at(buffer, starts + 1, "<i8") if len(starts) else starts)
 
 
-def by_channel(messages: Messages) -> dict[int, Messages]:
+def by_channel(buffer: Bytes, messages: Messages) -> dict[int, Messages]:
     """The messages of each channel."""
-    order = np.argsort(messages.channels, kind="stable")
-    channels = messages.channels[order]
-    starts, lengths = messages.starts[order], messages.lengths[order]
+    if not len(messages.starts):
+        return {}
+    channels = numbers_at(buffer, messages.starts + RECORD.size, "<u2")
+    order = np.argsort(channels, kind="stable")
+    starts, lengths, channels = messages.starts[order], messages.lengths[order], channels[order]
     bounds = [0, *(np.flatnonzero(channels[1:] != channels[:-1]) + 1).tolist(), len(channels)]
-    return {
-        int(channels[begin]): Messages(starts[begin:end], lengths[begin:end], channels[begin:end])
-        for begin, end in pairwise(bounds)
-        if end > begin
-    }
+    return {int(channels[begin]): Messages(starts[begin:end], lengths[begin:end]) for begin, end in pairwise(bounds)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 
 from agv_analysis.bags.errors import DamagedError
@@ -9,8 +10,14 @@ from agv_analysis.bags.errors import DamagedError
 MAX_CHUNK = 2**30
 """Most bytes that one chunk may inflate to: a thousand times what ROS 2 writes."""
 
+_PIECE = 2**22
+"""So many bytes are inflated at a time where nobody can say how many there are."""
+
 NAMES = ("", "zstd", "lz4")
 """Compressions of the MCAP registry."""
+
+_OF_THREAD = threading.local()
+"""A decompressor for each thread: to make one takes a tenth of the time that a chunk does."""
 
 _MAGICS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
 
@@ -45,7 +52,7 @@ def inflate_start(compression: str, content: bytes, limit: int) -> bytes:
     read, error = _READERS[compression](content)
     parts = []
     try:
-        while limit > 0 and (part := read(limit)):
+        while limit > 0 and (part := read(min(limit, _PIECE))):
             parts.append(part)
             limit -= len(part)
     except error as problem:
@@ -88,8 +95,10 @@ def _whole_zstd(content: bytes) -> bytes:
     """In one go, which is the fastest; what it allocates is the frame's own declaration, checked before."""
     import zstandard
 
+    if not hasattr(_OF_THREAD, "decompressor"):
+        _OF_THREAD.decompressor = zstandard.ZstdDecompressor()
     try:
-        return zstandard.ZstdDecompressor().decompress(content)
+        return bytes(_OF_THREAD.decompressor.decompress(content))
     except zstandard.ZstdError as error:
         raise DamagedError(f"zstd: {error}") from None
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.bags.batch import Batch, Bytes, Ints
+from agv_analysis.bags.batch import Batch, Bytes
 from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.chunk import (
     Content,
@@ -29,13 +29,13 @@ from agv_analysis.bags.chunk import (
     Messages,
     by_channel,
     cut_chunk,
-    find,
     is_as_declared,
     is_wrong_length,
     messages_at,
     open_chunk,
     rescue_chunk,
     run_of_messages,
+    sort_out,
     walk,
 )
 from agv_analysis.bags.compression import MAX_CHUNK
@@ -64,6 +64,7 @@ from agv_analysis.bags.records import (
     Channel,
     Chunk,
     Footer,
+    Index,
     Schema,
     Statistics,
     has_shape,
@@ -76,12 +77,14 @@ from agv_analysis.bags.records import (
     parse_statistics,
 )
 from agv_analysis.bags.source import Record, Source
-from agv_analysis.bags.storage import IsWanted
+from agv_analysis.bags.storage import LARGE, IsWanted
 
 _WINDOW = 2**20
-_AHEAD = 4
-_AHEAD_BYTES = 2**26
-"""Chunks, and bytes of them, that may be inflated ahead."""
+_TOGETHER = 2**22
+"""Bytes of chunks, when inflated, that go to the other thread at a time."""
+
+_AHEAD = 3 * _TOGETHER
+"""Bytes that may be inflated ahead, unless a single chunk has more."""
 
 _MAX_DAMAGES = 10_000
 """So many damaged places are passed over in a file."""
@@ -100,8 +103,8 @@ class _Packed(NamedTuple):
 
     position: int
     chunk: Chunk
-    places: list[Ints]
-    """Of its messages, as its message indexes name them."""
+    indexes: list[Index]
+    """Of its messages."""
 
 
 class _Opened(NamedTuple):
@@ -109,8 +112,8 @@ class _Opened(NamedTuple):
 
     content: bytes
     found: Content
-    is_by_index: bool
-    """Were its messages found by their message indexes?"""
+    is_indexed: bool
+    """Do its message indexes name exactly its messages?"""
 
 
 class _Cut(NamedTuple):
@@ -118,6 +121,17 @@ class _Cut(NamedTuple):
 
     position: int
     content: bytes
+
+
+_Item = _Run | _Packed | _Cut
+
+
+class _Some(NamedTuple):
+    """What goes to the other thread at a time."""
+
+    items: list[_Item]
+    size: int
+    """Bytes, when inflated."""
 
 
 class McapFile:
@@ -167,18 +181,22 @@ class McapFile:
 
     def batches(self, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         """The messages of all channels that are wanted, in file order, in batches of one channel. To be called once."""
-        for item, opened in _ahead(self._items()):
+        for item, opened in _ahead(self._items(), is_large=self.size > LARGE):
             self.position = item.position
             if isinstance(item, _Run):
                 if not self._is_proven:
                     self.findings.add_unchecked("messages outside of chunks", len(item.starts))
                 buffer = np.frombuffer(item.content, np.uint8)
                 messages = messages_at(buffer, np.array(item.starts, np.int64))
-                yield from self._split(buffer, by_channel(messages), is_wanted)
+                yield from self._split(buffer, by_channel(buffer, messages), is_wanted)
             elif isinstance(item, _Cut):
                 yield from self._content(item.position, item.content, walk(item.content, is_cut=True), False, is_wanted)
-            elif opened is not None:
+            elif isinstance(opened, _Opened):
                 yield from self._unpack(item, opened, is_wanted)
+            elif opened is not None:
+                number = sum(len(index.places) for index in item.indexes)
+                what = f"damaged chunk, left out ({opened})"
+                self.findings.add(what, at=item.position, messages=number, is_loss=True)
         self.position = self.size
         self._compare_with_statistics()
 
@@ -266,7 +284,7 @@ class McapFile:
 
     # -- records -----------------------------------------------------------------------------------------------------
 
-    def _items(self) -> Iterator[_Run | _Packed | _Cut]:
+    def _items(self) -> Iterator[_Item]:
         """What holds messages, chunks together with their message indexes; all else is taken note of on the way."""
         packed: _Packed | None = None
         for item in self._records():
@@ -289,7 +307,7 @@ class McapFile:
         """Take note of a record outside of chunks that holds no messages."""
         try:
             if record.opcode == MESSAGE_INDEX and packed is not None:
-                packed.places.append(parse_index(record.content))
+                packed.indexes.append(parse_index(record.content))
             elif record.opcode == METADATA:
                 name, content = parse_metadata(record.content)
                 self.metadata[name] = content
@@ -316,11 +334,11 @@ class McapFile:
             except DamagedError as error:
                 self.findings.add(f"damaged definition of a topic, not used ({error})")
 
-    def _records(self) -> Iterator[Record | _Run | _Packed | _Cut]:
+    def _records(self) -> Iterator[Record | _Item]:
         """Everything sound in the file, in order; what is not is passed over and reported."""
         position = len(MAGIC)
         while not self._source.is_end(position):
-            item: Record | _Run | _Packed | _Cut | None
+            item: Record | _Item | None
             try:
                 item, position = self._next(position)
             except DamagedError as error:
@@ -394,19 +412,14 @@ class McapFile:
 
     # -- chunks ------------------------------------------------------------------------------------------------------
 
-    def _unpack(self, packed: _Packed, opened: Future[_Opened], is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
+    def _unpack(self, packed: _Packed, opened: _Opened, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         chunk, position = packed.chunk, packed.position
-        try:
-            content, found, is_by_index = opened.result()
-        except DamagedError as error:
-            number = sum(map(len, packed.places))
-            self.findings.add(f"damaged chunk, left out ({error})", at=position, messages=number, is_loss=True)
-            return
+        content, found, is_indexed = opened
         if not chunk.crc:
             self.findings.add_unchecked("chunks")
         elif not is_as_declared(chunk, content):
             self.findings.add("chunk that misstates its size or compression, read all the same", at=position)
-        if packed.places and not is_by_index:
+        if packed.indexes and not is_indexed:
             self.findings.add("message index that does not fit its chunk, not used", at=position)
         yield from self._content(position, content, found, chunk.crc != 0, is_wanted)
 
@@ -422,35 +435,54 @@ class McapFile:
     def _split(
         self, buffer: Bytes, messages: dict[int, Messages], is_wanted: IsWanted
     ) -> Iterator[tuple[Channel, Batch]]:
+        lead, channels = RECORD.size + MESSAGE_HEAD - LEAD, self.channels
         for number, mine in messages.items():
-            channel = self.channels.get(number)
+            channel = channels.get(number)
             if channel is None:
                 what = f"message of channel {number}, which is not described, left out"
                 self.findings.add(what, len(mine.starts), is_loss=True)
                 continue
             self.counts[number] += len(mine.starts)
             if is_wanted(channel):
-                lead = RECORD.size + MESSAGE_HEAD - LEAD
                 yield channel, Batch(buffer, mine.starts + lead, mine.lengths - (MESSAGE_HEAD - LEAD))
 
 
-def _open(packed: _Packed) -> _Opened:
-    """Inflate and check a chunk, and find its messages. Raises DamagedError."""
-    content = open_chunk(packed.chunk)
-    found = find(content, packed.places)
-    return _Opened(content, found or walk(content), found is not None)
+def _open(item: _Item, is_large: bool) -> _Opened | DamagedError | None:
+    """A chunk inflated and checked, its messages found, or what is wrong with it; None for anything else."""
+    if not isinstance(item, _Packed):
+        return None
+    try:
+        content = open_chunk(item.chunk)
+    except DamagedError as error:
+        return error
+    return _Opened(content, *sort_out(content, item.indexes, is_large))
 
 
-def _ahead(items: Iterator[_Run | _Packed | _Cut]) -> Iterator[tuple[_Run | _Packed | _Cut, Future[_Opened] | None]]:
+def _open_all(items: list[_Item], is_large: bool) -> list[_Opened | DamagedError | None]:
+    return [_open(item, is_large) for item in items]
+
+
+def _ahead(items: Iterator[_Item], is_large: bool) -> Iterator[tuple[_Item, _Opened | DamagedError | None]]:
     """The same items, a few chunks ahead being opened on another thread."""
-    waiting: deque[tuple[_Run | _Packed | _Cut, Future[_Opened] | None]] = deque()
+    waiting: deque[tuple[_Some, Future[list[_Opened | DamagedError | None]]]] = deque()
     with ThreadPoolExecutor(1, "bag") as pool:
-        for item in items:
-            opened = pool.submit(_open, item) if isinstance(item, _Packed) else None
-            waiting.append((item, opened))
-            ahead = sum(min(item.chunk.size, MAX_CHUNK) for item, _ in waiting if isinstance(item, _Packed))
-            while waiting and (len(waiting) > _AHEAD or ahead > _AHEAD_BYTES):
-                item, opened = waiting.popleft()
-                ahead -= min(item.chunk.size, MAX_CHUNK) if isinstance(item, _Packed) else 0
-                yield item, opened
-        yield from waiting
+        for some in _together(items):
+            waiting.append((some, pool.submit(_open_all, some.items, is_large)))
+            while len(waiting) > 1 and sum(ahead.size for ahead, _ in waiting) > _AHEAD:
+                ready, opened = waiting.popleft()
+                yield from zip(ready.items, opened.result(), strict=True)
+        for ready, opened in waiting:
+            yield from zip(ready.items, opened.result(), strict=True)
+
+
+def _together(items: Iterator[_Item]) -> Iterator[_Some]:
+    """The items, several at a time unless they are large: to wake a thread takes as long as a small chunk does."""
+    some = _Some([], 0)
+    for item in items:
+        size = min(item.chunk.size, MAX_CHUNK) if isinstance(item, _Packed) else len(item.content)
+        some = _Some([*some.items, item], some.size + size)
+        if some.size >= _TOGETHER:
+            yield some
+            some = _Some([], 0)
+    if some.items:
+        yield some

@@ -30,6 +30,9 @@ MESSAGE_HEAD = 22
 FOOTER_SIZE = RECORD.size + 20
 DATA_END_SIZE = RECORD.size + 4
 
+TYPE_HASH = "topic_type_hash"
+"""Key in a channel's metadata that holds the hash of its type."""
+
 Read = Callable[[int, int], bytes]
 """Up to so many bytes (second argument) from a place (first), fewer at the end."""
 
@@ -50,6 +53,8 @@ def has_shape(opcode: int, length: int, read: Read) -> bool:
     """Do the lengths inside a record of a known kind add up to its own? `read` counts from the record's content."""
     if opcode == MESSAGE:
         return length >= MESSAGE_HEAD
+    if opcode == MESSAGE_INDEX:  # of which there are most
+        return length >= 6 and int.from_bytes(read(2, 4), "little") == length - 6
     position = 0
     for part in _SHAPES[opcode]:
         if part in "bB":
@@ -138,6 +143,13 @@ class Chunk(NamedTuple):
     content: bytes
 
 
+class Index(NamedTuple):
+    """Where the messages of a channel begin in their chunk, as it is said."""
+
+    channel: int
+    places: NDArray[np.int64]
+
+
 @dataclass(frozen=True)
 class Statistics:
     """What the writer counted."""
@@ -182,14 +194,13 @@ def parse_chunk(content: bytes) -> Chunk:
     return Chunk(cursor.number(8), cursor.number(4), cursor.text(), cursor.block(8))
 
 
-def parse_index(content: bytes) -> NDArray[np.int64]:
-    """Places in its chunk that a MessageIndex record names. Raises DamagedError."""
+def parse_index(content: bytes) -> Index:
+    """MessageIndex record. Raises DamagedError."""
     cursor = Cursor(content)
-    cursor.take(2)
-    entries = cursor.block()
+    channel, entries = cursor.number(2), cursor.block()
     if len(entries) % 16:
         raise DamagedError(f"a message index of {len(entries)} bytes, which is no whole number of entries")
-    return np.frombuffer(entries, "<i8")[1::2]
+    return Index(channel, np.frombuffer(entries, "<i8")[1::2])
 
 
 def parse_metadata(content: bytes) -> tuple[str, dict[str, str]]:

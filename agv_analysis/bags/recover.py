@@ -18,7 +18,7 @@ from agv_analysis.bags.bag import Progress
 from agv_analysis.bags.batch import Batch, Layouts
 from agv_analysis.bags.errors import BagError, UndecodableError
 from agv_analysis.bags.findings import Findings
-from agv_analysis.bags.records import Channel
+from agv_analysis.bags.records import TYPE_HASH, Channel
 from agv_analysis.bags.rosbag2 import METADATA, locate, open_files
 from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import Storage
@@ -182,5 +182,5 @@ def _topic_info(channel: Channel, kind: str) -> TopicInfo:
         qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
     except yaml.YAMLError:
         qos = []
-    type_hash = channel.metadata.get("topic_type_hash", "")
+    type_hash = channel.metadata.get(TYPE_HASH, "")
     return TopicInfo(channel.topic, kind, "", type_hash, qos if isinstance(qos, list) else [])

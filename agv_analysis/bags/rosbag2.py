@@ -123,7 +123,7 @@ def _read_metadata(path: Path) -> dict[str, Any]:
     """Content of a metadata.yaml. Raises ValueError, TypeError or KeyError if it is none."""
     try:
         with path.open("rb") as file:
-            text = file.read(_MAX_METADATA + 1)
+            text = file.read(min(path.stat().st_size, _MAX_METADATA) + 1)
         if len(text) > _MAX_METADATA:
             raise ValueError(f"it has more than {_MAX_METADATA} bytes")
         about = yaml.safe_load(text)["rosbag2_bagfile_information"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import NamedTuple
@@ -66,9 +67,9 @@ class Source:
     def _fetch(self, position: int, count: int) -> bytes:
         left, parts = max(0, min(count, self.size - position)), []
         try:
-            self._file.seek(position)
-            while left and (part := self._file.read(left)):
+            while left and (part := os.pread(self._file.fileno(), left, position)):
                 parts.append(part)
+                position += len(part)
                 left -= len(part)
         except OSError as error:
             raise BagError(f"{self.path}: cannot be read at byte {position}: {error.strerror}") from None

@@ -11,6 +11,9 @@ from agv_analysis.bags.batch import Batch
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.records import Attachment, Channel, Schema
 
+LARGE = 2**24
+"""Files of more bytes than this are read by compiled code, which takes a moment to be loaded."""
+
 IsWanted = Callable[[Channel], bool]
 
 

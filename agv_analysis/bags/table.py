@@ -107,7 +107,7 @@ class Table:
         self._message_bytes += int(batch.sizes.sum())
         done = 0
         while self._place is not None and done < len(batch):
-            rest = batch.after(done)
+            rest = batch.after(done) if done else batch
             self._make_room(len(rest))
             placed = self._place(
                 rest.buffer, rest.starts, rest.sizes, *self._recipes, self._store, self._dtype.itemsize, self._count
