@@ -171,6 +171,12 @@ def rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
     burst = found.burst_mean_square
     text = "" if burst is None else f"{burst:.4g} slots on average"
     yield f"Bursts, mean square{rate}", told(burst, "burst_max.mean_square", text)
+    name = "both_links.mean_square_growth"
+    if found.both_links is not None or "no answer" in found.reasons[name]:
+        growth = 0.0 if found.both_links is None else found.both_links
+        word = "dies out" if growth < 0.0 else "grows"
+        text = f"E\\[e^2] {word}, times {math.exp(growth):.6g} a step"
+        yield "Both links as they are, mean square", told(found.both_links, name, text)
     yield "What binds", "nothing" if found.binding is None else f"the error {found.binding} the track"
 
 

@@ -4,6 +4,7 @@
     lifted       the pose is n steps old at every step, speeds frozen: a delay; over a lap that turns: `floquet`
     bursts       up to n losses in a row, in any order, for ever: a joint spectral radius, bounded from both sides
     mean_square  random losses, E[|e|^2] dies out: a Markov jump linear system; `almost_sure`: almost every run does
+    both_links   the same where commands are lost as well
     floquet      one lap, or one recorded sequence of losses, again and again: what that very lap does
     empirical    twins that begin apart and meet the same losses: do they come together?
 

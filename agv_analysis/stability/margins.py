@@ -10,7 +10,7 @@ import numpy as np
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.stability import almost_sure, bursts, floquet, lifted, mean_square, paper
+from agv_analysis.stability import almost_sure, both_links, bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.chain import chain_of
 from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
@@ -61,6 +61,8 @@ class Margins:
     """Largest constant delay of the pose [s] on a straight track at the track's largest speed, between samples too."""
     binding: str | None
     """Which error the bursts blow up first: `along` the track or `across` it."""
+    both_links: float | None = None
+    """Growth (logarithm, per step) of E[e^2] with both links as they are; None unless the downlink loses commands."""
     reasons: dict[str, str] = field(default_factory=dict)
     """Why a margin is None, by its name in `to_json`."""
     left_out: tuple[str, ...] = ()
@@ -103,6 +105,7 @@ class Margins:
             "n_max": {"paper": self.n_paper, "lifted": self.n_lifted, "bursts": self.n_bursts},
             "p_max": {"mean_square": self.p_mean_square, "almost_sure": self.p_almost_sure},
             "burst_max": {"mean_square": self.burst_mean_square},
+            "both_links": {"mean_square_growth": self.both_links},
         }
         for group, values in tree.items():
             for name in list(values):
@@ -171,6 +174,7 @@ def margins(scenario: Scenario) -> Margins:
         loss_rate=loss_rate,
         burst_mean_square=burst,
         delay=None if edge.predicts else _delay(float(np.abs(v_r).max()), true, ts),
+        both_links=_both_links(scenario, v_r, w_r, edge, reasons),
         binding=_binding_of(edge, n_bursts, float(np.abs(v_r).max()), true, ts),
         reasons=reasons,
         left_out=left_out(scenario),
@@ -182,9 +186,7 @@ def left_out(scenario: Scenario) -> tuple[str, ...]:
     values = {f"plant.{name}": value for name, value in as_dict(scenario.plant).items()}
     usual = {f"plant.{name}": value for name, value in as_dict(PlantParameters()).items()}
     found = [name for name in values if name not in _KNOWN_TO_CRITERIA and values[name] != usual[name]]
-    downlink = scenario.relay.downlink.model
-    lossy = [] if downlink == "perfect" else [f"relay.downlink.model is {downlink}"]
-    return (*lossy, *(f"{name} is {values[name]}" for name in found))
+    return tuple(f"{name} is {values[name]}" for name in found)
 
 
 def _largest_constant_delay(
@@ -251,6 +253,26 @@ def _burst(
         reasons[name] = "no bound: bursts of a million slots on average are not too long"
         return loss_rate, None
     return loss_rate, _none_below_zero(found, name, reasons)
+
+
+def _both_links(scenario: Scenario, v_r: Floats, w_r: Floats, edge: Edge, reasons: dict[str, str]) -> float | None:
+    """Growth per step with both links as the scenario has them, None where nothing is lost or nothing can be said."""
+    name, policy = "both_links.mean_square_growth", scenario.plant.downlink_policy
+    uplink, downlink = chain_of(scenario.relay.uplink), chain_of(scenario.relay.downlink)
+    if downlink is not None and downlink.loss_rate == 0.0:
+        reasons[name] = "the downlink loses nothing"
+    elif uplink is None or downlink is None:
+        reasons[name] = "no answer: a channel is no finite Markov chain"
+    elif policy not in both_links.POLICIES:
+        reasons[name] = f"no answer: computed for a plant that holds its command or stops, not for {policy}"
+    elif scenario.relay.downlink.correlation != 0.0:
+        reasons[name] = "no answer: computed for links that lose independently of each other"
+    else:
+        growth = both_links.lap_growth(
+            v_r, w_r, scenario.controller, scenario.plant.ts, uplink, downlink, edge, policy == "zero"
+        )
+        return growth / len(v_r)
+    return None
 
 
 def _none_below_zero(margin: float, name: str, reasons: dict[str, str]) -> float | None:
