@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import hypothesis
 import pytest
 
 if TYPE_CHECKING:
@@ -43,6 +44,10 @@ _domain, _claim = _claim_domain()
 os.environ["ROS_DOMAIN_ID"] = str(_domain)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["PYTHONUNBUFFERED"] = "1"
+
+# The same examples every time, however busy the machine.
+hypothesis.settings.register_profile("agv_ncs", deadline=None, derandomize=True, database=None)
+hypothesis.settings.load_profile("agv_ncs")
 
 
 @pytest.fixture(scope="session", autouse=True)
