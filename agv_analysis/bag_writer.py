@@ -42,14 +42,19 @@ class TopicInfo(NamedTuple):
 
 
 class BagWriter:
-    """An open bag. `describe` is asked for a topic, by its number, when the first messages are written."""
+    """An open bag. `describe` is asked for a topic, by its number, when the first messages are written.
+
+    A topic that nobody offers is in the bag only once it has a message.
+    """
 
     def __init__(self, directory: Path, describe: Sequence[Callable[[], TopicInfo]], about: dict[str, str]) -> None:
         """Create the directory. Raises UserError if it exists or cannot be made."""
         self._directory = directory
         self._file_name = f"{directory.name}_0.mcap"
         self._describe = describe
-        self._topics: list[TopicInfo] = []
+        self._topics: dict[int, TopicInfo] = {}
+        self._channels: dict[int, int] = {}
+        self._schemas: dict[str, int] = {}
         self._pending: list[tuple[int, int, bytes, int]] = []
         self.counts = [0] * len(describe)
         self._first_ns, self._last_ns = 0, 0
@@ -76,7 +81,7 @@ class BagWriter:
     def close(self) -> None:
         """Write what is held back, the index and metadata.yaml."""
         self._write_all_but(0)
-        topics = list(zip(self._topics, self.counts, strict=True))
+        topics = [(topic, self.counts[number]) for number, topic in sorted(self._topics.items())]
         metadata = rosbag2_metadata(self._file_name, self._first_ns, self._last_ns, topics)
         self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata_text(metadata)})
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -86,25 +91,27 @@ class BagWriter:
 
     def _write_all_but(self, newest: int) -> None:
         if not self._topics:
-            self._register()
+            for number, describe in enumerate(self._describe):
+                topic = describe()
+                if topic.offered_qos or self.counts[number]:
+                    self._register(number, topic)
         self._pending.sort()
         count = len(self._pending) - newest
-        for log_time_ns, topic, data, publish_time_ns in self._pending[:count]:
-            self._writer.add_message(topic + 1, log_time_ns, data, publish_time_ns)
+        for log_time_ns, number, data, publish_time_ns in self._pending[:count]:
+            if number not in self._channels:
+                self._register(number, self._describe[number]())
+            self._writer.add_message(self._channels[number], log_time_ns, data, publish_time_ns)
         if count > 0:
             self._first_ns = self._first_ns or self._pending[0][0]
             self._last_ns = max(self._last_ns, self._pending[count - 1][0])
             del self._pending[:count]
 
-    def _register(self) -> None:
-        schemas: dict[str, int] = {}
-        for describe in self._describe:
-            topic = describe()
-            self._topics.append(topic)
-            if topic.type not in schemas:
-                schemas[topic.type] = self._writer.register_schema(topic.type, "ros2msg", topic.schema.encode())
-            about = {"offered_qos_profiles": metadata_text(topic.offered_qos), "topic_type_hash": topic.type_hash}
-            self._writer.register_channel(topic.name, "cdr", schemas[topic.type], about)
+    def _register(self, number: int, topic: TopicInfo) -> None:
+        self._topics[number] = topic
+        if topic.type not in self._schemas:
+            self._schemas[topic.type] = self._writer.register_schema(topic.type, "ros2msg", topic.schema.encode())
+        about = {"offered_qos_profiles": metadata_text(topic.offered_qos), "topic_type_hash": topic.type_hash}
+        self._channels[number] = self._writer.register_channel(topic.name, "cdr", self._schemas[topic.type], about)
 
 
 def rosbag2_metadata(
