@@ -32,6 +32,7 @@ TOPICS: dict[str, type] = {
     "agv/ground_truth": PoseStamped,
     "edge/pose": PoseStamped,
     "edge/slot": TimeReference,
+    "edge/age": TimeReference,
     "edge/error": Odometry,
     "edge/cmd_vel": TwistStamped,
     "agv/cmd_vel": TwistStamped,

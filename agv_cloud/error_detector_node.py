@@ -1,4 +1,7 @@
-"""The error detector: compares the reference with the freshest pose that the edge holds."""
+"""The error detector: compares the reference with the freshest pose that the edge holds.
+
+It steps with each slot that the relay announces, lost or not; or, behind a real radio, by its own clock.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import TimeReference
 
+from agv_cloud.freshest_pose import FreshestPose
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
 from agv_cloud.reference_path import path_points
@@ -19,26 +23,33 @@ from agv_cloud.staleness import Posture, Prediction
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.unicycle import STEPS
 from agv_ros.executor import run_node
+from agv_ros.message_types import ODOMETRY
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
-from agv_ros.stamps import Steps
+from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
 from agv_ros.transforms import TransformBroadcaster
 from agv_ros.wire import (
     FRAME_MAP,
     FRAME_REFERENCE,
     InvalidMessageError,
     Pose,
+    Slot,
     TrackingError,
     decode_command,
+    decode_error,
     decode_pose,
     decode_slot,
     encode_error,
+    encode_slot,
     stamp_of,
 )
 
+TIMER = "timer"
+"""What edge/age says of its slots, in place of a verdict."""
+
 
 class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
-    """Answers each uplink slot with one edge/error, from a fresh pose or from an outdated one."""
+    """Answers each uplink slot, or each tick of its clock, with one edge/error, be its pose fresh or outdated."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("error_detector", ErrorDetectorParameters, **node_options)
@@ -54,8 +65,19 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._transforms = TransformBroadcaster(self, FRAME_REFERENCE)
         if not self._transforms.available:  # said here only: there is no loop without this node
             self.get_logger().info("tf2_msgs is not installed: no node of this loop publishes transforms on /tf")
-        self.input(PoseStamped, "edge/pose", self._on_pose, self._error_out)
-        self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
+        self._is_odometry = self.settings.pose_type == ODOMETRY
+        self._freshest = FreshestPose(self.grid.ts_ns)
+        self._missed = 0
+        self._oldest_ns = 0
+        kind = Odometry if self._is_odometry else PoseStamped
+        if self.settings.trigger == TIMER:
+            self._age_out = self.output(TimeReference, "edge/age", side=True)
+            self.input(kind, "edge/pose", self._keep_pose, self._error_out)
+            is_simulated = bool(self.get_parameter("use_sim_time").value)
+            self.create_timer(self.settings.ts, self._tick, clock=self.get_clock() if is_simulated else self._steady)
+        else:
+            self.input(kind, "edge/pose", self._on_pose, self._error_out)
+            self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
         self._publish_path()
         if self._predicts:
             self.input(TwistStamped, "edge/cmd_vel", self._on_command)
@@ -77,9 +99,14 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
     def _new_prediction(self) -> Prediction:
         return Prediction(STEPS[self.settings.integration], self.settings.ts)
 
+    def _decode_pose(self, data: bytes) -> Pose:
+        return Pose(*decode_error(data)[:4]) if self._is_odometry else decode_pose(data)
+
+    # -- by slots ----------------------------------------------------------------------------------------------------
+
     def _on_pose(self, data: bytes) -> None:
         try:
-            ready = self._join.add_message(decode_pose(data))
+            ready = self._join.add_message(self._decode_pose(data))
         except InvalidMessageError:
             self._answer(self._join.reject(stamp_of(data)))
             raise
@@ -113,12 +140,58 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         if pose is None:
             self._blind += 1
             return
-        k, taken = self.grid.step(stamp_ns), self.grid.step(pose.stamp_ns)
-        now, held = self.reference[k], Posture(pose.x, pose.y, pose.theta)
+        k = self.grid.step(stamp_ns)
+        if k == 0:
+            self._prediction = self._new_prediction()  # a run begins: what was sent in one before it is past
+        self._compare(k, self.grid.step(pose.stamp_ns), pose)
+
+    # -- by its own clock --------------------------------------------------------------------------------------------
+
+    def _keep_pose(self, data: bytes) -> None:
+        beginnings = self._freshest.beginnings
+        self._freshest.offer(self._decode_pose(data), self.get_clock().now().nanoseconds)
+        if self._freshest.beginnings > beginnings:
+            self._begin()
+
+    def _begin(self) -> None:
+        """The AGV has been heard for the first time, or has started anew."""
+        first_ns, ts_ns = self._freshest.first_ns, self.grid.ts_ns
+        if self.settings.begin == "first_pose":
+            self.grid = Grid(first_ns, ts_ns)
+        elif not 0 <= first_ns - self.grid.start_ns <= MAX_FIRST * ts_ns:
+            self.fail(
+                f"the first pose has the stamp {first_ns / NS_PER_S:.3f} s, which is in no run that begins at "
+                f"start_time = {self.settings.start_time:g} s: set it, or set error_detector.begin to first_pose"
+            )
+        self._steps = Steps(self.grid)
+        self._prediction = self._new_prediction()
+        self._answered = -1
+
+    def _tick(self) -> None:
+        pose = self._freshest.pose
+        if pose is None or self.finished:
+            return
+        time_ns = self._freshest.time(self.get_clock().now().nanoseconds)
+        k = self._nearest_step(time_ns)
+        if k <= self._answered:
+            return
+        self._missed += k - self._answered - 1 if self._answered >= 0 else 0
+        stamp_ns = self.grid.stamp(k)
+        self._oldest_ns = max(self._oldest_ns, stamp_ns - pose.stamp_ns)
+        self.report_every_second(stamp_ns)
+        self._age_out.publish(encode_slot(Slot(stamp_ns, pose.stamp_ns, TIMER)))
+        self._compare(k, min(k, self._nearest_step(pose.stamp_ns)), pose)
+
+    def _nearest_step(self, stamp_ns: int) -> int:
+        return max(0, (stamp_ns - self.grid.start_ns + self.grid.ts_ns // 2) // self.grid.ts_ns)
+
+    # -- either way --------------------------------------------------------------------------------------------------
+
+    def _compare(self, k: int, taken: int, pose: Pose) -> None:
+        """Publish the error of step k, as a pose tells it that was taken at step `taken`."""
+        stamp_ns, now, held = self.grid.stamp(k), self.reference[k], Posture(pose.x, pose.y, pose.theta)
         target = self.reference[taken] if self.settings.policy == "align" else now
         if self._predicts:
-            if k == 0:
-                self._prediction = self._new_prediction()  # a run begins: what was sent in one before it is past
             held = self._prediction.at(k, taken, held)
         eps = tracking_error(target.x, target.y, target.theta, *held)
         self._answered = k
@@ -127,7 +200,17 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._error_out.publish(encode_error(error, self.settings.frame_prefix))
 
     def facts(self) -> dict[str, str]:
-        """Slots that were not answered, by reason."""
+        """Slots that were not answered, by reason; or how the edge's clock and the AGV's get along."""
+        if self.settings.trigger == TIMER:
+            freshest = self._freshest
+            return {
+                "clock offset": f"{freshest.offset_ns / NS_PER_S:.6f}",
+                "oldest pose": f"{self._oldest_ns / NS_PER_S:.6f}",
+                "stamps in the future": str(freshest.future),
+                "outdated messages": str(freshest.outdated),
+                "beginnings": str(freshest.beginnings),
+                "missed steps": str(self._missed),
+            }
         return {
             "slots without any pose": str(self._blind),
             "slots whose pose never came": str(self._join.unanswered),

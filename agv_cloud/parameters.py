@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from agv_cloud.staleness import POLICIES
 from agv_cloud.tracks import TRACKS
 from agv_plant.unicycle import STEPS
+from agv_ros.message_types import POSE_TYPES
 from agv_ros.parameters import LoopParameters, ParameterError, parameter
+
+TRIGGERS = ("slot", "timer")
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,22 @@ class ErrorDetectorParameters(LoopParameters):
     )
     integration: str = parameter(
         "euler", "predict: how the plant's model integrates one period, as plant.integration", choices=tuple(STEPS)
+    )
+
+    trigger: str = parameter(
+        "slot",
+        "what makes the edge step; slot: each slot of edge/slot, lost or not, timer: its own clock, every ts, with the "
+        "freshest pose that it holds and no slots, as behind a real radio; its age is then on edge/age",
+        choices=TRIGGERS,
+    )
+    begin: str = parameter(
+        "start_time",
+        "timer: instant of step 0 in the time of the AGV's stamps; start_time: that one, first_pose: the stamp of the "
+        "first pose that arrives, for a robot whose clock is not known",
+        choices=("start_time", "first_pose"),
+    )
+    pose_type: str = parameter(
+        "pose", "type of edge/pose; pose: geometry_msgs/PoseStamped, odometry: nav_msgs/Odometry", choices=POSE_TYPES
     )
 
     def __post_init__(self) -> None:

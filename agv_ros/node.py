@@ -192,10 +192,14 @@ class LoopNode(Node, Generic[P]):
 
         Called before a step's answer is published, so that no other node's report of the step can come before it.
         """
-        k = self.grid.step(stamp_ns)
+        k = self._period_of(stamp_ns)
         self._last_ns = max(self._last_ns, stamp_ns)
         if k % self._steps_per_report == 0:
             self.report(stamp_ns)
+
+    def _period_of(self, stamp_ns: int) -> int:
+        """The step in whose period an instant lies: other people's robots do not keep to the grid."""
+        return (stamp_ns - self.grid.start_ns) // self.grid.ts_ns
 
     def report(self, stamp_ns: int) -> None:
         """Publish this node's diagnostics now."""
@@ -231,7 +235,7 @@ class LoopNode(Node, Generic[P]):
 
     def _say_changed(self, before: dict[str, Any]) -> None:
         """Report what has another value than `before`, so that a recording says from which step on it holds."""
-        after, k = as_dict(self.settings), self.grid.step(self._last_ns)
+        after, k = as_dict(self.settings), self._period_of(self._last_ns)
         changed = {name: value for name, value in after.items() if value != before[name]}
         for name, value in changed.items():
             self._changes[f"{CHANGED}{name}"] = f"{before[name]} -> {value} after step {k}"

@@ -276,6 +276,81 @@ def test_stamps_off_the_grid_are_rejected(bench: Bench) -> None:
     assert relay.rejected == {"agv/pose": 1}
 
 
+# -- an edge with a clock of its own ----------------------------------------------------------------------------------
+
+
+def stamp_ns_of(stamp: Any) -> int:
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def on_its_own(bench: Bench, **parameters: Any) -> tuple[Any, Any, list[Any], list[Any]]:
+    """An error detector with a timer, where its poses come from, its errors, and the age of what they rest on."""
+    detector = bench.add(
+        ErrorDetectorNode, trigger="timer", ts=0.02, track="line", track_start=[0.0, 0.0, 0.0], **parameters
+    )
+    kind = Odometry if parameters.get("pose_type") == "odometry" else PoseStamped
+    errors, ages = bench.received(Odometry, "edge/error"), bench.received(TimeReference, "edge/age")
+    return detector, bench.publisher(kind, "edge/pose"), errors, ages
+
+
+def test_without_slots_the_edge_steps_by_its_clock_and_records_the_age_of_its_pose(bench: Bench) -> None:
+    detector, poses, errors, ages = on_its_own(bench)
+    first = pose(0, x=-1.0)
+    poses.publish(first)
+    bench.until(lambda: len(errors) > 20 and len(ages) > 20)
+
+    def is_taken() -> bool:
+        """Is a later pose at the edge? Its stamp is the time that the edge takes for the AGV's."""
+        later = pose(0, x=-2.0)
+        later.header.stamp = errors[-1].header.stamp
+        poses.publish(later)
+        return bool(ages[-1].time_ref != first.header.stamp)
+
+    bench.until(is_taken)
+    bench.until(lambda: len(ages) == len(errors))
+    stamps = [stamp_ns_of(error.header.stamp) for error in errors]
+    assert all((ns - 1_000_000_000) % 20_000_000 == 0 for ns in stamps)
+    assert stamps == sorted(set(stamps))
+    for error, age in zip(errors, ages, strict=True):
+        assert age.header.stamp == error.header.stamp
+        assert age.source == "timer"
+        k = (stamp_ns_of(error.header.stamp) - 1_000_000_000) // 20_000_000
+        held = -1.0 if age.time_ref == first.header.stamp else -2.0
+        assert error.pose.pose.position.x == pytest.approx(0.02 * k - held)
+    assert float(detector.facts()["oldest pose"]) >= 0.2
+
+
+def test_a_stamp_from_the_future_is_counted_and_not_believed(bench: Bench) -> None:
+    detector, poses, errors, _ = on_its_own(bench)
+    for k in (0, 10**6, 10**7):
+        poses.publish(pose(k))
+    bench.until(lambda: detector.facts()["stamps in the future"] == "2")
+    bench.until(lambda: len(errors) > 5)
+    assert stamp_ns_of(errors[-1].header.stamp) < 1_000_000_000 + 5_000_000 * 10**6
+    assert detector.facts()["beginnings"] == "1"
+
+
+def test_odometry_of_a_robot_whose_clock_nobody_knows(bench: Bench) -> None:
+    detector, odometry, errors, ages = on_its_own(bench, pose_type="odometry", begin="first_pose")
+    message = Odometry()
+    message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000, 123_456_789
+    message.pose.pose.position.x, message.pose.pose.orientation.w = -1.0, 1.0
+    odometry.publish(message)
+    bench.until(lambda: len(errors) > 3 and len(ages) > 3)
+    k = (stamp_ns_of(errors[-1].header.stamp) - 1_700_000_000_123_456_789) // 20_000_000
+    assert errors[-1].pose.pose.position.x == pytest.approx(1.0 + 0.02 * k)
+    assert detector.failure == ""
+
+
+def test_a_clock_that_cannot_be_the_run_s_is_said(bench: Bench) -> None:
+    detector, poses, _, _ = on_its_own(bench)
+    late = pose(0)
+    late.header.stamp.sec = 2_100_000_000
+    poses.publish(late)
+    bench.until(lambda: detector.finished)
+    assert "start_time = 1 s: set it, or set error_detector.begin to first_pose" in detector.failure
+
+
 # -- real time --------------------------------------------------------------------------------------------------------
 
 

@@ -17,7 +17,6 @@ from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import (
-    NONE,
     Case,
     Statistics,
     at_rest,
@@ -135,12 +134,11 @@ class _Batch:
     def _case(self, job: Job, airs: Airs) -> Case:
         row, column = job
         scenario, air = self._scenarios[row], airs(self._seeds[column], self._steps[row])
-        settings = settings_of(scenario)
         return Case(
             numbers(air.verdicts(scenario.relay.uplink, "uplink")),
             numbers(air.verdicts(scenario.relay.downlink, "downlink")),
             at_rest(*scenario.plant.initial_pose),
-            settings,
-            numbers(air.normals(NOISE)) if settings.noisy else numbers(NONE),
-            numbers(air.normals(SLIP)) if settings.slips else numbers(NONE),
+            settings_of(scenario),
+            numbers(air.normals(NOISE)) if scenario.plant.is_noisy else None,
+            numbers(air.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,
         )

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
+from agv_analysis.simulation.loop import Rows
 from agv_plant.motion import measured
 from agv_plant.random_stream import DRAWS, normal_pair, uniforms
 
@@ -18,23 +19,20 @@ def normals(seed: int, stream: str, steps: int) -> Floats:
     return found
 
 
-def _fill(random: NDArray[np.float64], found: NDArray[np.float64]) -> None:
+def _fill(random: Rows, found: NDArray[np.float64]) -> None:
     for k in range(len(random)):
         found[k, 0], found[k, 1] = normal_pair(random[k][0], random[k][1])
         found[k, 2], found[k, 3] = normal_pair(random[k][2], random[k][3])
 
 
-def measurements(pose: Floats, noise: Floats, noise_xy: float, noise_theta: float) -> Floats:
+def measurements(pose: Floats, noise: Rows, noise_xy: float, noise_theta: float) -> Floats:
     """Poses as the AGV measures them, from the true ones, shape (N, 3), and normal numbers of N steps or more."""
     found = np.empty_like(pose)
-    compiled(_measure)(numbers(pose), numbers(noise), noise_xy, noise_theta, found)
+    compiled(_measure)(numbers(pose), noise, noise_xy, noise_theta, found)
     return found
 
 
-def _measure(
-    pose: NDArray[np.float64], noise: NDArray[np.float64], noise_xy: float, noise_theta: float,
-    found: NDArray[np.float64],
-) -> None:  # fmt: skip
+def _measure(pose: Rows, noise: Rows, noise_xy: float, noise_theta: float, found: NDArray[np.float64]) -> None:
     for k in range(len(pose)):
         x, y, theta = pose[k]
         n_x, n_y, n_theta, _ = noise[k]

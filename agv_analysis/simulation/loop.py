@@ -4,6 +4,9 @@ What the four nodes do between one pose and the next, in lockstep: the relay pas
 detector compares the reference with the freshest pose that it holds, the controller answers, the relay passes the
 command on or loses it, the plant integrates under the freshest command that it holds. Everything here runs both as
 plain Python and compiled, so it keeps to what numba knows: floats, tuples, arrays.
+
+What a run does not have is None: numba compiles a function anew for it, without the branch that nobody takes. The
+paper's plant thus costs nothing of what can be had beside it.
 """
 
 from __future__ import annotations
@@ -20,13 +23,9 @@ from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import share_of_command
 from agv_plant.motion import Body, Motion, measured, move, plant_step
-from agv_plant.random_stream import DRAWS
 
 Rows = NDArray[np.float64] | list[list[float]]
 Flags = NDArray[np.bool_] | list[bool]
-
-NONE = np.empty((0, DRAWS))
-"""Random numbers of a run that needs none."""
 
 
 class Settings(NamedTuple):
@@ -37,19 +36,16 @@ class Settings(NamedTuple):
     ktheta: float
     v_max: float
     ts: float
+    arc: bool
+    """Does the plant integrate along the arc, or by Euler?"""
     policy: int
     """Staleness policy at the edge, one of `staleness.HOLD`, `ALIGN`, `PREDICT`."""
     model_arc: bool
-    """Does the edge's model of the plant integrate along the arc, or by Euler?"""
-    plain: bool
-    """Is the plant the paper's? Then what follows is at its defaults and need not be looked at."""
+    """The same as `arc`, for the edge's model of the plant."""
     downlink_policy: int
     ramp_steps: float
-    body: Body
-    slips: bool
-    """Are there random numbers for the wheels?"""
-    noisy: bool
-    """Is the pose that the AGV measures another than the true one?"""
+    body: Body | None
+    """The AGV, if it is not the paper's, which does what it is told."""
     noise_xy: float
     noise_theta: float
 
@@ -99,9 +95,9 @@ class Case(NamedTuple):
     downlink_lost: Flags
     start: Loop
     settings: Settings
-    noise: Rows = NONE
-    """Normal numbers of its slots for the measured pose, shape (N, 4); empty if there is no noise."""
-    slip: Rows = NONE
+    noise: Rows | None = None
+    """Normal numbers of its slots for the measured pose, shape (N, 4); None if there is no noise."""
+    slip: Rows | None = None
     """The same for the wheels."""
 
 
@@ -117,19 +113,31 @@ def slot(
     loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: Case, k: int
 ) -> tuple[Loop, Answer]:
     """From one pose to the next, under the verdicts of both links on slot k and with the reference at this step."""
-    x, y, theta = loop.x, loop.y, loop.theta
-    lost, downlink_lost, settings = case.lost[k], case.downlink_lost[k], case.settings
-    n_left = n_right = 0.0
-    if settings.slips:
-        n_left, n_right = case.slip[k][0], case.slip[k][1]
-    if lost or settings.noisy:
-        held = outdated(loop) if lost else perceived(loop, x_r, y_r, theta_r, case.noise, k, settings)
-        sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
-        return obey(held, sent, downlink_lost, n_left, n_right, settings), sent
+    n_left, n_right = wheels(case.slip, k)
+    if case.lost[k]:
+        held = outdated(loop)
+        sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
+        return obey(held, sent, case.downlink_lost[k], n_left, n_right, case.settings), sent
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
+    x, y, theta = sent_pose(loop, case.noise, k, case.settings)
     held = received(loop, x, y, theta, x_r, y_r, theta_r, 0)
-    sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
-    return obey(held, sent, downlink_lost, n_left, n_right, settings), sent
+    sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
+    return obey(held, sent, case.downlink_lost[k], n_left, n_right, case.settings), sent
+
+
+def sent_pose(loop: Loop, noise: Rows | None, k: int, settings: Settings) -> tuple[float, float, float]:
+    """The pose that the AGV says it has."""
+    if noise is None:
+        return loop.x, loop.y, loop.theta
+    n_x, n_y, n_theta, _ = noise[k]
+    return measured(loop.x, loop.y, loop.theta, n_x, n_y, n_theta, settings.noise_xy, settings.noise_theta)
+
+
+def wheels(slip: Rows | None, k: int) -> tuple[float, float]:
+    """Normal numbers of the left and the right wheel in slot k."""
+    if slip is None:
+        return 0.0, 0.0
+    return slip[k][0], slip[k][1]
 
 
 def outdated(loop: Loop) -> Loop:
@@ -159,16 +167,6 @@ def commanded(loop: Loop, v: float, w: float, n_dl: int) -> Loop:
     )  # fmt: skip
 
 
-def perceived(
-    loop: Loop, x_then: float, y_then: float, theta_then: float, noise: Rows, k: int, settings: Settings
-) -> Loop:
-    """The edge holds the pose of now, as the AGV measures it."""
-    x, y, theta = measured(
-        loop.x, loop.y, loop.theta, noise[k][0], noise[k][1], noise[k][2], settings.noise_xy, settings.noise_theta
-    )
-    return received(loop, x, y, theta, x_then, y_then, theta_then, 0)
-
-
 def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings) -> Answer:
     """The edge's answer, from the pose that it holds.
 
@@ -192,22 +190,28 @@ def obey(loop: Loop, sent: Answer, lost: bool, n_left: float, n_right: float, se
     v, w, n_dl = sent.v, sent.w, 0
     if lost or not are_finite(v, w, 0.0):
         v, w, n_dl = loop.v, loop.w, loop.n_dl + 1
-    if settings.plain:
-        v_driven, w_driven, a_driven = v, w, 0.0
-        x, y, theta = plant_step(settings.body.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
-    else:
-        share = share_of_command(n_dl, settings.downlink_policy, settings.ramp_steps)
-        before = Motion(loop.x, loop.y, loop.theta, loop.v_driven, loop.w_driven, loop.a_driven)
-        x, y, theta, v_driven, w_driven, a_driven = move(before, share * v, share * w, n_left, n_right, settings.body)
+    moved = period(loop, v, w, n_dl, n_left, n_right, settings.body, settings)
     x_held, y_held, theta_held = loop.x_held, loop.y_held, loop.theta_held
     if settings.policy == PREDICT and are_finite(sent.v, sent.w, 0.0):
         x_held, y_held, theta_held = plant_step(
             settings.model_arc, x_held, y_held, theta_held, sent.v, sent.w, settings.ts
         )
     return Loop(
-        x, y, theta, x_held, y_held, theta_held, loop.x_then, loop.y_then, loop.theta_then, loop.n_ul, v, w, n_dl,
-        v_driven, w_driven, a_driven,
+        moved.x, moved.y, moved.theta, x_held, y_held, theta_held, loop.x_then, loop.y_then, loop.theta_then, loop.n_ul,
+        v, w, n_dl, moved.v, moved.w, moved.a,
     )  # fmt: skip
+
+
+def period(
+    loop: Loop, v: float, w: float, n_dl: int, n_left: float, n_right: float, body: Body | None, settings: Settings
+) -> Motion:
+    """The plant's motion in a period under a command (v, w) that was sent n_dl steps ago."""
+    if body is None:
+        x, y, theta = plant_step(settings.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
+        return Motion(x, y, theta, v, w, 0.0)
+    share = share_of_command(n_dl, settings.downlink_policy, settings.ramp_steps)
+    before = Motion(loop.x, loop.y, loop.theta, loop.v_driven, loop.w_driven, loop.a_driven)
+    return move(before, share * v, share * w, n_left, n_right, body)
 
 
 def goes_on(loop: Loop, sent: Answer) -> bool:

@@ -12,7 +12,7 @@ from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.chance import measurements, normals
-from agv_analysis.simulation.loop import NONE, Case, Settings, at_rest, history
+from agv_analysis.simulation.loop import Case, Settings, at_rest, history
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
 from agv_cloud.staleness import POLICIES
@@ -37,16 +37,16 @@ def simulate(scenario: Scenario) -> Run:
     downlink_lost = losses(relay.downlink, relay.seed, "downlink", steps)
     rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
     plant, start, settings = scenario.plant, at_rest(*scenario.plant.initial_pose), settings_of(scenario)
-    noise = normals(plant.seed, NOISE, steps) if settings.noisy else NONE
-    slip = normals(plant.seed, SLIP, steps) if settings.slips else NONE
-    case = Case(numbers(lost), numbers(downlink_lost), start, settings, numbers(noise), numbers(slip))
+    noise = numbers(normals(plant.seed, NOISE, steps)) if plant.is_noisy else None
+    slip = numbers(normals(plant.seed, SLIP, steps)) if plant.slip_noise > 0.0 else None
+    case = Case(numbers(lost), numbers(downlink_lost), start, settings, noise, slip)
     done = compiled(history)(numbers(reference), case, rows, n_ul)
     pose = rows[:done, 0:3]
     return Run(
         scenario=scenario,
         k=np.arange(done),
         pose=pose,
-        measured=measurements(pose, noise, plant.noise_xy, plant.noise_theta) if settings.noisy else None,
+        measured=measurements(pose, noise, plant.noise_xy, plant.noise_theta) if noise is not None else None,
         reference=reference[:done],
         error=rows[:done, 3:6],
         command=rows[:done, 6:8],
@@ -93,16 +93,18 @@ def settings_of(scenario: Scenario) -> Settings:
     """What a slot of the loop needs to know of a scenario."""
     gains, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
     body = body_of(plant)
+    is_paper = (
+        plant.downlink_policy == "hold" and body._replace(arc=_PAPERS_BODY.arc, ts=_PAPERS_BODY.ts) == _PAPERS_BODY
+    )
     return Settings(
         kx=gains.kx, ky=gains.ky, ktheta=gains.ktheta, v_max=gains.v_max, ts=plant.ts,
+        arc=plant.integration == "arc",
         policy=POLICIES.index(edge.policy),
         model_arc=edge.integration == "arc",
-        plain=body._replace(arc=_PAPERS_BODY.arc, ts=_PAPERS_BODY.ts) == _PAPERS_BODY
-        and plant.downlink_policy == "hold",
         downlink_policy=DOWNLINK_POLICIES.index(plant.downlink_policy),
         ramp_steps=plant.ramp_time / plant.ts,
-        body=body, slips=plant.slip_noise > 0.0,
-        noisy=plant.is_noisy, noise_xy=plant.noise_xy, noise_theta=plant.noise_theta,
+        body=None if is_paper else body,
+        noise_xy=plant.noise_xy, noise_theta=plant.noise_theta,
     )  # fmt: skip
 
 
