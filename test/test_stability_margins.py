@@ -92,6 +92,16 @@ def test_the_delay_margin() -> None:
     assert math.floor(n) == found.n_lifted == 12
 
 
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [("error_detector.policy=predict", "held"), ("controller.kx=401.0", "even without"), ("controller.kx=0.0", "even")],
+)
+def test_without_a_delay_margin_there_is_a_reason(setting: str, reason: str) -> None:
+    found = of("error_detector.track=line", setting).to_json()
+    assert found["delay_margin"] is None
+    assert reason in found["delay_margin_reason"]
+
+
 def test_what_binds() -> None:
     """Along L T_s K_x < 2, across about L T_s v min(2 / K_theta, 2 K_theta / K_y)^-1 < 1."""
     slow = load_scenario(str(REPOSITORY / "config/paper.yaml"), ["controller.kx=0.5"]).controller

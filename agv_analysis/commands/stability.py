@@ -160,8 +160,8 @@ def rows(found: Margins, ts: float) -> Iterator[tuple[str, str]]:
 
     yield "Paper's test, constant n_ul", told(found.n_paper, "n_max.paper", steps(found.n_paper))
     yield "Pose always n steps old", told(found.n_lifted, "n_max.lifted", steps(found.n_lifted))
-    if found.delay is not None:
-        yield "Delay margin, straight track", f"{found.delay * 1e3:.4g} ms"
+    delay = "" if found.delay is None else f"{found.delay * 1e3:.4g} ms"
+    yield "Delay margin, straight track", told(found.delay, "delay_margin", delay)
     yield "Any outages up to n", told(found.n_bursts, "n_max.bursts", steps(found.n_bursts))
     p = found.p_mean_square
     yield "Independent losses, mean square", told(p, "p_max.mean_square", _probability(p))

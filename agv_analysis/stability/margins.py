@@ -113,12 +113,16 @@ class Margins:
                     values[f"{name}_reason"] = self.reasons[f"{group}.{name}"]
         return {
             **tree,
-            "delay_margin": self.delay,
+            **_with_reason("delay_margin", self.delay, self.reasons),
             "loss_rate": self.loss_rate,
             "binding": self.binding,
             "left_out": list(self.left_out),
             "disagreements": self.disagreements(),
         }
+
+
+def _with_reason(name: str, value: float | None, reasons: dict[str, str]) -> dict[str, Any]:
+    return {name: value} if name not in reasons else {name: value, f"{name}_reason": reasons[name]}
 
 
 def _steps(n: int) -> str:
@@ -173,7 +177,7 @@ def margins(scenario: Scenario) -> Margins:
         p_almost_sure=p_almost_sure,
         loss_rate=loss_rate,
         burst_mean_square=burst,
-        delay=None if edge.predicts else _delay(float(np.abs(v_r).max()), true, ts),
+        delay=_delay(float(np.abs(v_r).max()), true, ts, edge, reasons),
         both_links=_both_links(scenario, v_r, w_r, edge, reasons),
         binding=_binding_of(edge, n_bursts, float(np.abs(v_r).max()), true, ts),
         reasons=reasons,
@@ -221,10 +225,18 @@ def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
     return ACROSS
 
 
-def _delay(v: float, gains: ControllerParameters, ts: float) -> float | None:
+def _delay(v: float, gains: ControllerParameters, ts: float, edge: Edge, reasons: dict[str, str]) -> float | None:
     """Sampled delay margin [s] in closed form; None where no loop is stable or nothing can delay it too long."""
     steps = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(v, gains, ts))
-    return ts * steps if 0.0 < steps < math.inf else None
+    if edge.predicts:
+        reasons["delay_margin"] = "no answer: between samples it is computed for a pose that is held; see n_max.lifted"
+    elif steps <= 0.0:
+        reasons["delay_margin"] = "not met: the error does not contract even without a delay"
+    elif math.isinf(steps):
+        reasons["delay_margin"] = "no bound: no delay is too long"
+    else:
+        return ts * steps
+    return None
 
 
 def _lap(scenario: Scenario) -> int:
