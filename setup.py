@@ -60,6 +60,7 @@ setup(
             "mcap-ros2-support>=0.5",
             "mypy>=1.10",
             "pyarrow>=12.0",
+            "pypdfium2>=4.0",
             "pytest>=7.4",
             "pytest-cov>=4.1",
             "pytest-xdist>=3.3",

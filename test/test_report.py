@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
 import re
@@ -11,14 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import yaml
+from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.analysis import Analysis, analyse, observe
 from agv_analysis.recording import read_run
 from agv_analysis.report.figures import draw_figures
 from agv_analysis.report.page import render, sentence, write_report
 from agv_analysis.report.panels import LINE, Line, lifted_multipliers, panels, paper_eigenvalues, thinned
+from agv_analysis.report.sweep import sweep_figure, write_sweep_report
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
+from agv_analysis.sweep.plan import Sweep, parse_axis
 from agv_ros.errors import UserError
 
 if TYPE_CHECKING:
@@ -26,8 +31,9 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).parents[1]
 SAMPLE = REPOSITORY / "bags/sample"
+STORE = get_typestore(Stores.ROS2_JAZZY)
 
-HOSTILE = "</script><script>window.harm = 1</script><img src=x onerror='window.harm = 1'>{{ 7 * 7 }}\"'&"
+HOSTILE = "</script><script>window.harm = 1</script><img src=x onerror='window.harm = 1'>{{ 7 * 7 }}\"'&\u202e"
 
 
 def scenario_of(*settings: str, config: str = "outages") -> Any:
@@ -57,9 +63,8 @@ def show(chrome: Chrome, path: Path) -> None:
 
 
 def complaints(chrome: Chrome) -> list[str]:
-    """What the page has had to complain of; a remark of the graphics driver is no complaint."""
-    log = chrome.get_log("browser")  # type: ignore[no-untyped-call]
-    return [entry["message"] for entry in log if "GL Driver Message" not in entry["message"]]
+    """What the page has had to complain of."""
+    return [entry["message"] for entry in chrome.get_log("browser")]  # type: ignore[no-untyped-call]
 
 
 def of_plot(chrome: Chrome, key: str, expression: str) -> Any:
@@ -109,6 +114,34 @@ def test_dragging_over_one_plot_zooms_all_that_share_its_time(shown: Chrome) -> 
     assert complaints(shown) == []
 
 
+def printed(chrome: Chrome, path: Path) -> Any:
+    """The page as printed, an open PDF."""
+    pdfium = pytest.importorskip("pypdfium2", reason="needs pypdfium2: pip install '.[test]'")
+    show(chrome, path)
+    a4 = {"paperWidth": 8.27, "paperHeight": 11.69, "printBackground": True}  # [inch]
+    answer = chrome.execute_cdp_cmd("Page.printToPDF", a4)
+    return pdfium.PdfDocument(base64.b64decode(answer["data"]))
+
+
+def test_it_prints(chromium: Chrome, page: Path) -> None:
+    document = printed(chromium, page)
+    sheets = [sheet.render(scale=1.0).to_numpy()[..., :3].astype(int) for sheet in document]
+    texts = [sheet.get_textpage().get_text_range() for sheet in document]
+    assert 4 <= len(sheets) <= 10
+    # white paper, with a margin on each side
+    assert all((sheet == 255).all(axis=-1).mean() > 0.5 for sheet in sheets)
+    inked = [(sheet < 200).any(axis=-1) for sheet in sheets]
+    assert [i for i, ink in enumerate(inked) if ink[:, :30].any() or ink[:, -30:].any() or ink[:30].any()] == []
+    titles = ("Track", "Errors, speed, age of information", "Outages of the uplink", "Eigenvalues")
+    assert [title for title in titles if not any(title in text for text in texts)] == []
+    # a plot that is not cut has the title of its axis in the middle of the sheet
+    for title in ("time [s]", "length [slots]"):
+        (sheet,) = (sheet for sheet, text in zip(document, texts, strict=True) if title in text)
+        found, _ = sheet.get_textpage().search(title).get_next()
+        left, _, _, _ = sheet.get_textpage().get_charbox(found)
+        assert 0.45 < left / sheet.get_width() < 0.55, title
+
+
 def test_it_fits_a_phone_and_follows_dark_and_light(shown: Chrome) -> None:
     from selenium.webdriver.support.ui import WebDriverWait
 
@@ -140,6 +173,86 @@ def test_hostile_strings_of_a_recording_do_no_harm(chromium: Chrome, tmp_path: P
     assert complaints(chromium) == []
     assert HOSTILE in chromium.execute_script("return document.body.textContent")
     assert "proves nothing" in chromium.find_element("id", "verdict").text
+
+
+def rewritten(bag: Path, folder: Path) -> Path:
+    """A bag as somebody with bad intentions would record it: topics, frames, texts, parameters, the file's name."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    folder.mkdir(parents=True)
+    path = folder / "<img src=x onerror='window.harm = 1'>\u202e\"&.mcap"
+    with next(bag.glob("*.mcap")).open("rb") as source, path.open("wb") as stream:
+        reader, writer = make_reader(source), Writer(stream)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if message.log_time >= 3_000_000_000:  # 400 steps are enough
+                continue
+            assert schema is not None
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(f"/{HOSTILE}{channel.topic}", "cdr", known)
+            data = badly_named(schema.name, message.data)
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
+            if channel.topic == "/agv/pose" and message.log_time < 1_025_000_000:  # off the grid, as the report tells
+                moved = data[:8] + (int.from_bytes(data[8:12], "little") + 1).to_bytes(4, "little") + data[12:]
+                writer.add_message(channels[channel.id], message.log_time, moved, message.publish_time)
+        for metadata in reader.iter_metadata():
+            told = dict(metadata.metadata)
+            if "params" in told:
+                told["params"] = told["params"].replace("track_file: ''", f"track_file: {json.dumps(HOSTILE)}")
+                assert "onerror" in told["params"]
+            writer.add_metadata(metadata.name, told)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def badly_named(kind: str, data: bytes) -> bytes:
+    """A message whose every string is hostile."""
+    message: Any = STORE.deserialize_cdr(data, kind)
+    if hasattr(message, "header"):
+        message.header.frame_id = HOSTILE
+    if hasattr(message, "child_frame_id"):
+        message.child_frame_id = HOSTILE
+    for status in getattr(message, "status", ()):
+        status.name = status.message = status.hardware_id = HOSTILE
+        for pair in status.values:
+            pair.key = pair.value = HOSTILE
+    return bytes(STORE.serialize_cdr(message, kind))
+
+
+def test_a_hostile_recording_is_text_in_its_report(
+    chromium: Chrome, agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    bad = rewritten(SAMPLE, tmp_path / "bags")
+    status, said = agv_ncs("analyse", bad, "--picture", tmp_path / "a.png", "--report", tmp_path / "bad.html")
+    assert status == 0, said[-500:]
+    show(chromium, tmp_path / "bad.html")
+    assert chromium.execute_script("return [typeof window.harm, document.images.length]") == ["undefined", 0]
+    assert complaints(chromium) == []
+    shown = chromium.execute_script("return document.body.innerText")
+    # the topic's name in a note, the parameter, the file's name; nothing else of the recording is in the page
+    assert f"/{HOSTILE}/agv/pose: 5 messages are no sampling instant's" in shown
+    parameters = yaml.safe_load(chromium.find_element("id", "parameters").text)
+    assert parameters["error_detector"]["ros__parameters"]["track_file"] == HOSTILE
+    assert bad.name in shown
+
+
+def test_what_turns_letters_round_ends_where_it_began(chromium: Chrome, tmp_path: Path) -> None:
+    run = dataclasses.replace(read_run(SAMPLE), source="\u202etneconni.mcap")
+    write_report(analyse(run), tmp_path / "round.html")
+    show(chromium, tmp_path / "round.html")
+    # of a text that runs from left to right, what comes later is further right
+    places = chromium.execute_script("""
+        const text = document.querySelector("#verdict + p").lastChild, range = document.createRange();
+        return ["steps", " ms"].map(word => {
+            range.setStart(text, text.data.indexOf(word));
+            range.setEnd(text, text.data.indexOf(word) + word.length);
+            return range.getBoundingClientRect().left;
+        });
+    """)
+    assert places[0] < places[1]
 
 
 def test_the_page_asks_for_nothing_from_elsewhere(page: Path) -> None:
@@ -229,6 +342,60 @@ def test_a_sweep_has_a_report(
     assert of_plot(chromium, "instability", "plot._fullData[0].type") == kind
     assert len(chromium.find_elements("css selector", "#points tr")) == points + 1
     assert (tmp_path / "instability.svg").is_file()
+
+
+def swept(*axes: str) -> Sweep:
+    base = scenario_of("relay.uplink.model=bernoulli", "error_detector.track=line")
+    return Sweep(base, tuple(parse_axis(axis) for axis in axes), 1)
+
+
+def calm(sweep: Sweep) -> list[dict[str, Any]]:
+    """Rows of a sweep that nobody has run: what is stable does not matter here."""
+    told = {"instability": 0.0, "instability_low": 0.0, "instability_high": 1.0, "unstable": 0, "runs": 1}
+    names = [axis.name for axis in sweep.axes]
+    return [dict(zip(names, sweep.values(i), strict=True)) | told for i in range(sweep.size)]
+
+
+def test_theory_s_border_is_drawn_in_a_sweep_s_map(chromium: Chrome, tmp_path: Path) -> None:
+    sweep = swept("controller.kx=50:390:3", "relay.uplink.p=0.05:0.9:3")
+    write_sweep_report(sweep, calm(sweep), tmp_path / "s.html", "agv-ncs sweep")
+    show(chromium, tmp_path / "s.html")
+    assert complaints(chromium) == []
+    names = of_plot(chromium, "instability", "plot.data.map(trace => trace.name)")
+    assert names[1:] == ["border: mean square", "border: almost surely"]
+    # points of the line as it is drawn, back from pixels to the axes' units
+    script = """(() => {
+        const { xaxis, yaxis } = plot._fullLayout, path = plot.querySelector(".contourlevel path");
+        return [...Array(21).keys()].map(i => path.getPointAtLength(path.getTotalLength() * i / 20))
+            .map(point => [xaxis.p2d(point.x), yaxis.p2d(point.y)]);
+    })()"""
+    kx, p = np.array(of_plot(chromium, "instability", script)).T
+    a = 0.005 * kx
+    np.testing.assert_allclose(p, (2.0 - a) / (2.0 + a), atol=0.01)  # independent losses, mean square
+    assert np.ptp(kx) > 200.0
+
+
+def test_theory_s_border_is_drawn_in_a_sweep_s_curve() -> None:
+    sweep = swept("relay.uplink.p=0.5:0.99:3")
+    traces = {trace["name"]: trace for trace in sweep_figure(sweep, calm(sweep))["data"]}
+    x, again, gap = traces["border: mean square"]["x"]
+    a = 0.005 * 25.0
+    assert (x, gap) == (again, None)
+    assert x == pytest.approx((2.0 - a) / (2.0 + a), abs=0.01)
+
+
+def test_a_reference_that_the_parameters_do_not_name_has_no_margins_and_says_so(lap: Analysis) -> None:
+    run = simulate(scenario_of("plant.duration=5.0"))
+    moved = dataclasses.replace(run, reference=run.reference + np.array([0.0, 0.1, 0.0, 0.0, 0.0]))
+    assert "not the track that its parameters name" in render(analyse(moved))
+    assert "not the track that its parameters name" not in render(analyse(run))
+
+
+def test_a_track_from_a_file_has_margins(tmp_path: Path) -> None:
+    (tmp_path / "line.csv").write_text("t,v,w\n0.0,1.0,0.0\n5.0,1.0,0.0\n")
+    track = ("error_detector.track=csv", f"error_detector.track_file={tmp_path / 'line.csv'}", "plant.duration=5.0")
+    html = render(analyse(simulate(scenario_of(*track))))
+    assert "12 steps (60 ms)" in html  # a pose that is always that old, along a line with K_x = 25
 
 
 def test_a_folder_that_cannot_be_written_to_is_named(lap: Analysis, tmp_path: Path) -> None:

@@ -47,8 +47,8 @@ def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
     values = list(told(run))
     others = [""] * len(values) if other is None else [value for _, value in told(other)]
     return Answer(
-        track=figure([first], _MOST_POINTS, webgl=False),
-        time=figure(over_time, _MOST_POINTS, webgl=False),
+        track=figure([first], _MOST_POINTS),
+        time=figure(over_time, _MOST_POINTS),
         rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
     )
 

@@ -18,8 +18,10 @@ import numpy as np
 from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
+from agv_analysis.run import Run
 from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE
 from agv_analysis.version import version
+from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 
 _FEW = 2000
@@ -151,11 +153,26 @@ def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
 
 
 def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
+    """Margins over the scenario's track, or why there are none."""
     from agv_analysis.commands.stability import rows
     from agv_analysis.stability.margins import margins
 
-    if isinstance(analysis, Analysis) and analysis.run.scenario.error_detector.track_file == "":
+    if not isinstance(analysis, Analysis):
+        yield "Margins", f"not computed: {GAINS_UNKNOWN}"
+        return
+    try:
+        if not _drives_its_track(analysis.run):
+            yield "Margins", "not computed: the recording's reference is not the track that its parameters name"
+            return
         yield from rows(margins(analysis.run.scenario), analysis.run.ts)
+    except UserError as error:  # a recording may come without the file of its track
+        yield "Margins", f"not computed: {error}"
+
+
+def _drives_its_track(run: Run) -> bool:
+    """Is the run's reference that of the track which its parameters name? A recorded one need not be."""
+    expected = Reference(run.scenario.error_detector).first(int(run.k[-1]) + 1)[run.k]
+    return bool(np.allclose(run.reference[:, :2], expected[:, :2], rtol=0.0, atol=1e-6))
 
 
 def versions() -> dict[str, str]:

@@ -222,9 +222,10 @@ def to_json(panel: Panel, most: int) -> dict[str, Any]:
         "title": panel.title,
         "x": panel.x_label,
         "y": panel.y_label,
-        "lines": {line.name: {"x": _plain(line.x), "y": _plain(line.y)} for line in lines},
+        "lines": {line.name: {"x": plain(line.x), "y": plain(line.y)} for line in lines},
     }
 
 
-def _plain(values: Floats) -> list[float | None]:
+def plain(values: Floats) -> list[float | None]:
+    """Numbers for JSON, in seven digits: null where nothing is drawn."""
     return [float(f"{value:.7g}") if np.isfinite(value) else None for value in values.tolist()]

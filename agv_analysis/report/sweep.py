@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agv_analysis.report.page import fill, versions, write_page
-from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel
+from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, plain
 from agv_analysis.report.plotly import figure
-from agv_analysis.sweep.picture import can_draw, draw
-from agv_analysis.sweep.plan import Sweep
+from agv_analysis.sweep.picture import BORDERS, across_and_up, border_maps, border_places, can_draw, draw
+from agv_analysis.sweep.plan import Axis, Sweep
 from agv_ros.errors import UserError
 
 _MOST_ROWS = 500
@@ -54,15 +55,27 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
 
 
 def sweep_figure(sweep: Sweep, rows: Rows) -> dict[str, Any]:
-    """Probability of instability: with its confidence over one axis, as a heat map over two."""
+    """Probability of instability: with its confidence over one axis, as a heat map over two; with theory's borders."""
     if len(sweep.axes) == 1:
-        (axis,) = sweep.axes
-        rows = sorted(rows, key=lambda row: float(row[axis.name]))
-        x = np.array([row[axis.name] for row in rows], dtype=np.float64)
-        names = (("instability", DRIVEN), ("instability_low", LIMIT), ("instability_high", LIMIT))
-        lines = tuple(Line(name, x, np.array([row[name] for row in rows]), role) for name, role in names)
-        return figure([Panel("instability", "Instability", axis.label, "probability", lines, y_range=(-0.02, 1.02))])
-    across, up = sorted(sweep.axes, key=lambda axis: axis.name != "controller.kx")
+        return _curve(sweep, sweep.axes[0], rows)
+    return _heat_map(sweep, rows)
+
+
+def _curve(sweep: Sweep, axis: Axis, rows: Rows) -> dict[str, Any]:
+    rows = sorted(rows, key=lambda row: float(row[axis.name]))
+    x = np.array([row[axis.name] for row in rows], dtype=np.float64)
+    names = (("instability", DRIVEN), ("instability_low", LIMIT), ("instability_high", LIMIT))
+    lines = tuple(Line(name, x, np.array([row[name] for row in rows]), role) for name, role in names)
+    found = figure([Panel("instability", "Instability", axis.label, "probability", lines, y_range=(-0.02, 1.02))])
+    for name, places in border_places(sweep.base, axis).items():
+        if places:
+            x_border = [x for place in places for x in (place, place, None)]
+            found["data"].append(_border(name, "scatter", x_border, [0.0, 1.0, None] * len(places)) | {"mode": "lines"})
+    return found
+
+
+def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
+    across, up = across_and_up(sweep)
     x_values, y_values = sorted(across.values), sorted(up.values)
     places = {(row[across.name], row[up.name]): row["instability"] for row in rows}
     z = [[places.get((i, j)) for i in x_values] for j in y_values]
@@ -71,8 +84,25 @@ def sweep_figure(sweep: Sweep, rows: Rows) -> dict[str, Any]:
         "xaxis": {"title": {"text": across.label}}, "yaxis": {"title": {"text": up.label}},
         "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
         "margin": {"l": 60, "r": 12, "t": 8, "b": 44},
+        "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
     }  # fmt: skip
-    return {"data": [{**heat, "colorscale": "Viridis"}], "layout": layout}
+    return {"data": [{**heat, "colorscale": "Viridis"}, *_borders(sweep, across, up)], "layout": layout}
+
+
+def _borders(sweep: Sweep, across: Axis, up: Axis) -> Iterator[dict[str, Any]]:
+    """Contours of zero: left of them, or below, the loop is stable along a straight track."""
+    x, y, maps = border_maps(sweep.base, across, up)
+    for name, margin in maps.items():
+        at_zero = {"start": 0.0, "end": 0.0, "size": 1.0, "coloring": "none"}
+        z = [plain(row) for row in margin]
+        yield _border(name, "contour", x, y) | {"z": z, "contours": at_zero, "showscale": False}
+
+
+def _border(name: str, kind: str, x: Any, y: Any) -> dict[str, Any]:
+    line = {"color": BORDERS[name], "dash": "dash", "width": 2}
+    return {
+        "type": kind, "name": f"border: {name}", "x": x, "y": y, "line": line, "showlegend": True, "hoverinfo": "skip",
+    }  # fmt: skip
 
 
 def draw_sweep_figures(sweep: Sweep, rows: Rows, folder: Path) -> None:

@@ -65,33 +65,58 @@ def _curve(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) ->
     if metric == "instability":
         low, high = ([row[f"instability_{end}"] for row in rows] for end in ("low", "high"))
         axes.fill_between(x, low, high, color="#1f6fb4", alpha=0.2, label="95 % confidence")
-    fine = _between(axis)
-    for name, colour in BORDERS.items():
-        margin = margins(sweep.base, (axis,), [(value,) for value in fine])[name]
-        for before in np.flatnonzero(margin[:-1] * margin[1:] < 0.0):
-            axes.axvline(0.5 * (fine[before] + fine[before + 1]), color=colour, ls="--", label=f"border: {name}")
+    for name, places in border_places(sweep.base, axis).items():
+        for place in places:
+            axes.axvline(place, color=BORDERS[name], ls="--", label=f"border: {name}")
     axes.set(xlabel=axis.label, ylabel=_title(metric))
     axes.legend(fontsize="small")
 
 
 def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) -> Any:
-    across, up = sorted(sweep.axes, key=lambda axis: axis.name != "controller.kx")
+    across, up = across_and_up(sweep)
     x, y = sorted(across.values), sorted(up.values)
     places = {(row[across.name], row[up.name]): row[metric] for row in rows}
     heat = np.array([[places.get((i, j), np.nan) for i in x] for j in y], dtype=np.float64)
     heat[np.isinf(heat)] = np.nan
     low, high = (0.0, 1.0) if metric == "instability" else (None, None)
     image = axes.pcolormesh(x, y, heat, shading="nearest", cmap="viridis", vmin=low, vmax=high)
-    fine = _between(across), _between(up)
-    found = margins(sweep.base, (across, up), [(i, j) for j in fine[1] for i in fine[0]])
-    for name, colour in BORDERS.items():
-        margin = np.ma.masked_invalid(found[name].reshape(len(fine[1]), len(fine[0])))
-        if margin.count() and margin.min() < 0.0 < margin.max():
-            axes.contour(*fine, margin, levels=[0.0], colors=colour, linestyles="--")
-            axes.plot([], [], color=colour, ls="--", label=f"border: {name}")
-            axes.legend(loc="upper right", fontsize="small")
+    *fine, found = border_maps(sweep.base, across, up)
+    for name, margin in found.items():
+        axes.contour(*fine, np.ma.masked_invalid(margin), levels=[0.0], colors=BORDERS[name], linestyles="--")
+        axes.plot([], [], color=BORDERS[name], ls="--", label=f"border: {name}")
+        axes.legend(loc="upper right", fontsize="small")
     axes.set(xlabel=across.label, ylabel=up.label)
     return image
+
+
+def across_and_up(sweep: Sweep) -> tuple[Axis, Axis]:
+    """The axes of a map from left to right and from bottom to top: K_x, if it is varied, lies across."""
+    across, up = sorted(sweep.axes, key=lambda axis: axis.name != "controller.kx")
+    return across, up
+
+
+def border_places(base: Scenario, axis: Axis) -> dict[str, list[float]]:
+    """Where on an axis the borders of stability are crossed, by name of the border, as `margins`."""
+    fine = _between(axis)
+    found = margins(base, (axis,), [(value,) for value in fine])
+    crossed = {name: np.flatnonzero(margin[:-1] * margin[1:] < 0.0).tolist() for name, margin in found.items()}
+    return {name: [0.5 * (fine[i] + fine[i + 1]) for i in places] for name, places in crossed.items()}
+
+
+def border_maps(base: Scenario, across: Axis, up: Axis) -> tuple[list[float], list[float], dict[str, Floats]]:
+    """Values across (M,) and up (N,), and on their grid (N, M) by name of the border how far a point is from it.
+
+    The border is where that is zero; only those that cross the grid are there. Signs and NaN are those of `margins`.
+    """
+    x, y = _between(across), _between(up)
+    found = margins(base, (across, up), [(i, j) for j in y for i in x])
+    maps = {name: margin.reshape(len(y), len(x)) for name, margin in found.items()}
+    return x, y, {name: margin for name, margin in maps.items() if _changes_sign(margin)}
+
+
+def _changes_sign(margin: Floats) -> bool:
+    finite = margin[np.isfinite(margin)]
+    return bool(finite.size and finite.min() < 0.0 < finite.max())
 
 
 def _between(axis: Axis) -> list[float]:
