@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import signal
 import socket
 from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
+from agv_analysis.analysis import analyse
 from agv_analysis.explore.answer import answer, told, under_the_outages_of
+from agv_analysis.explore.lap import Newest, lap_beside, lap_rows
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
+from agv_analysis.report.page import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_analysis.simulation.single import simulate
 from agv_ros.parameters import ParameterError
@@ -74,6 +79,41 @@ def test_both_runs_are_drawn(base: Scenario) -> None:
     assert all(trace["type"] == "scatter" for trace in found.time["data"])
 
 
+def test_a_pinned_setting_has_margins_of_its_own_under_the_same_outages(base: Scenario) -> None:
+    slow = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0))
+    both = {name: (value, other) for name, value, other in lap_beside(base, slow)}
+    assert both["Pose always n steps old"] == ("12 steps (60 ms)", "62 steps (310 ms)")
+    assert both["Any outages up to n"] == ("14 steps (70 ms)", "78 steps (390 ms)")
+    alone = lap_rows(slow)
+    assert {name: other for name, (_, other) in both.items()} == dict(alone)
+
+
+def test_the_losses_of_a_run_are_judged_as_the_analysis_does(base: Scenario) -> None:
+    found = dict(lap_rows(base))
+    analysis = analyse(simulate(base))
+    assert found["Verdict"] == sentence(analysis)
+    assert found["These very losses"] == f"stable, an error grows by a factor {analysis.floquet:.6g} a step"
+
+
+def test_of_calls_that_wait_only_the_newest_is_made(tmp_path: Path) -> None:
+    pipe, file = tmp_path / "pipe", tmp_path / "file"
+    os.mkfifo(pipe)
+    file.write_text("later")
+    newest: Newest[str] = Newest(Path.read_text)
+    try:
+        with ThreadPoolExecutor(3) as threads:
+            first = threads.submit(newest, pipe)
+            with pipe.open("w") as writer:  # opens once it is read from: the first call has its turn
+                others = [threads.submit(newest, file) for _ in range(2)]
+                done, _ = wait(others, timeout=60.0, return_when=FIRST_COMPLETED)
+                assert [call.result() for call in done] == [None]  # without waiting for the first
+                writer.write("first")
+            assert first.result(60.0) == "first"
+            assert {call.result(60.0) for call in others} == {None, "later"}
+    finally:
+        newest.close()
+
+
 def test_the_presets_tell_the_story(base: Scenario) -> None:
     def late(key: str) -> tuple[float, str]:
         run = simulate(scenario_of(base, preset_values(base, key)))
@@ -97,16 +137,19 @@ def address(base: Scenario) -> Iterator[str]:
     import threading
 
     from agv_analysis.explore.app import HOST, build
+    from agv_analysis.explore.lap import Newest, lap_beside
 
     pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
     from werkzeug.serving import make_server
 
-    server = make_server(HOST, 0, build(base).server, threaded=True)
+    lap = Newest(lap_beside)
+    server = make_server(HOST, 0, build(base, lap).server, threaded=True)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield f"http://{HOST}:{server.server_port}/"
     server.shutdown()
     thread.join()
+    lap.close()
     server.server_close()
 
 
@@ -124,7 +167,7 @@ class Page:
         from selenium.webdriver.support.ui import WebDriverWait
 
         ignored = [StaleElementReferenceException]
-        WebDriverWait(self.chrome, 60.0, 0.05, ignored_exceptions=ignored).until(lambda _: condition())
+        WebDriverWait(self.chrome, 300.0, 0.05, ignored_exceptions=ignored).until(lambda _: condition())
 
     def click(self, name: str) -> None:
         self.chrome.execute_script("arguments[0].click()", self.chrome.find_element("id", name))
@@ -164,6 +207,28 @@ def test_moving_a_slider_simulates_anew(page: Page) -> None:
     assert kx > 25.0
     page.until(lambda: f"up to {n} along" in page.text("told"))
     assert page.text("problem") == ""
+    assert complaints(page) == []
+
+
+def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    from agv_analysis.commands.stability import rows
+    from agv_analysis.stability.margins import margins
+
+    def expected(kx: float) -> dict[str, str]:
+        changed = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=kx))
+        return dict(rows(margins(changed), 0.005))
+
+    def shown() -> dict[str, str]:
+        cells = "[...row.cells].map(cell => cell.innerText)"
+        rows = page.chrome.execute_script(f"return [...document.querySelectorAll('#lap tr')].map(row => {cells})")
+        return {name: value for name, value, _ in rows}
+
+    before, after = expected(25.0), expected(28.0)
+    page.until(lambda: before.items() <= shown().items())
+    page.slider("kx").send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)  # three moves, the last counts
+    page.until(lambda: after.items() <= shown().items())
     assert complaints(page) == []
 
 

@@ -6,7 +6,8 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
-from agv_analysis.explore.answer import Answer, answer
+from agv_analysis.explore.answer import answer
+from agv_analysis.explore.lap import Newest, lap_beside
 from agv_analysis.explore.settings import CHOICES, PRESETS, SLIDERS, preset_values, scenario_of, values_of
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
@@ -24,12 +25,18 @@ main { display: flex; flex-wrap: wrap; gap: 1rem; padding: 1rem; max-width: 1400
 label { display: block; font-size: .85rem; color: #5b6570; margin-top: .3rem }
 button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
 th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
-pre { white-space: pre-wrap }
+pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
 """
 
 
-def build(base: Scenario) -> Any:
-    """The page as a Dash app. Raises UserError if Dash is not installed."""
+Lap = Callable[[Scenario, Scenario | None], list[tuple[str, str, str]] | None]
+"""As `lap_beside`; None if the setting was moved on before its turn came."""
+
+_MOVED_ON = [("Not computed", "the page was moved on", "")]
+
+
+def build(base: Scenario, lap: Lap = lap_beside) -> Any:
+    """The page as a Dash app; `lap` may take its time. Raises UserError if Dash is not installed."""
     try:
         dash: Any = importlib.import_module("dash")
     except ImportError:
@@ -37,7 +44,7 @@ def build(base: Scenario) -> Any:
     app = dash.Dash("agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets")
     app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
     app.layout = _layout(dash, values_of(base))
-    _connect(dash, app, base)
+    _connect(dash, app, base, lap)
     return app
 
 
@@ -62,6 +69,8 @@ def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
         ),
         html.Div("", id="problem", role="alert"),
         html.Table([], id="told"),
+        html.H2("Over the whole lap"),
+        dcc.Loading(html.Table([], id="lap")),
         dcc.Graph(id="plot-track", style={"height": "420px"}, config={"displaylogo": False}),
         dcc.Graph(id="plot-time", style={"height": "620px"}, config={"displaylogo": False}),
         html.Pre("", id="exported"),
@@ -76,7 +85,7 @@ def _slider(dcc: Any, slider: Any, value: float) -> Any:
     return dcc.Slider(slider.low, slider.high, slider.step, value=value, marks=ends, id=slider.key, updatemode="drag")
 
 
-def _connect(dash: Any, app: Any, base: Scenario) -> None:
+def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
     Input, Output, State = dash.Input, dash.Output, dash.State
     inputs, states = [Input(key, "value") for key in KEYS], [State(key, "value") for key in KEYS]
 
@@ -95,7 +104,17 @@ def _connect(dash: Any, app: Any, base: Scenario) -> None:
             found = answer(scenario_of(base, values(tuple(settings))), other)
         except UserError as error:
             return dash.no_update, dash.no_update, dash.no_update, str(error)
-        return found.track, found.time, _told(dash.html, found), ""
+        return found.track, found.time, _table(dash.html, found.rows), ""
+
+    @app.callback(Output("lap", "children"), *inputs, Input("pinned", "data"))
+    def over_the_lap(*given: Any) -> Any:
+        *settings, pinned = given
+        try:
+            scenario = scenario_of(base, values(tuple(settings)))
+            found = lap(scenario, None if pinned is None else scenario_of(base, pinned))
+        except UserError:  # `move` says why
+            return []
+        return _table(dash.html, _MOVED_ON if found is None else found)
 
     @app.callback(
         Output("pinned", "data"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"), *states,
@@ -126,8 +145,8 @@ def _connect(dash: Any, app: Any, base: Scenario) -> None:
         return f"{command}\n\n# explored.yaml\n{text}", {"content": text, "filename": "explored.yaml"}
 
 
-def _told(html: Any, found: Answer) -> list[Any]:
-    return [html.Tr([html.Th(name), html.Td(value), html.Td(other)]) for name, value, other in found.rows]
+def _table(html: Any, rows: list[tuple[str, str, str]]) -> list[Any]:
+    return [html.Tr([html.Th(name), html.Td(value), html.Td(other)]) for name, value, other in rows]
 
 
 def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
@@ -135,7 +154,8 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
 
     Raises UserError if the port is taken or Dash is not installed.
     """
-    app = build(base)
+    lap = Newest(lap_beside)
+    app = build(base, lap)
     werkzeug: Any = importlib.import_module("werkzeug.serving")
     quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), {"log": lambda *_: None})
     try:
@@ -148,4 +168,5 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
     except KeyboardInterrupt:
         pass
     finally:
+        lap.close()
         server.server_close()

@@ -1,0 +1,92 @@
+"""What takes longer than a move may: the criteria for the whole lap and for the very losses of the run."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import signal
+import threading
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from agv_analysis.explore.answer import under_the_outages_of
+from agv_analysis.scenario import Scenario
+from agv_ros.errors import UserError
+
+R = TypeVar("R")
+
+
+def lap_beside(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:
+    """Name, value and that of a pinned scenario, which meets the same outages; empty without one."""
+    others = {} if pinned is None else dict(lap_rows(under_the_outages_of(pinned, scenario)))
+    return [(name, value, others.get(name, "")) for name, value in lap_rows(scenario)]
+
+
+@functools.lru_cache(maxsize=64)
+def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
+    """The verdict, what the losses of the simulated run do, and the margins of a scenario over its lap.
+
+    What cannot be simulated has no rows: the page says why at once.
+    """
+    from agv_analysis.analysis import analyse
+    from agv_analysis.commands.stability import rows
+    from agv_analysis.report.page import sentence
+    from agv_analysis.simulation.single import simulate
+    from agv_analysis.stability.margins import margins
+
+    try:
+        analysis = analyse(simulate(scenario))
+        found = [("Verdict", sentence(analysis))]
+        if analysis.floquet is not None:
+            said = "stable" if analysis.floquet < 1.0 else "unstable"
+            found.append(("These very losses", f"{said}, an error grows by a factor {analysis.floquet:.6g} a step"))
+        return found + list(rows(margins(scenario), scenario.plant.ts))
+    except UserError:
+        return []
+
+
+class Newest(Generic[R]):
+    """Makes calls in another process, one at a time; of those that wait for their turn only the newest is made.
+
+    So a slider that is dragged does not leave a queue behind it, and the page's own process answers moves meanwhile.
+    """
+
+    def __init__(self, function: Callable[..., R]) -> None:
+        self._function = function
+        self._changed = threading.Condition()
+        self._newest = 0
+        self._busy = False
+        self._process: Any = None
+
+    def __call__(self, *arguments: Any) -> R | None:
+        """What the function, one of a module, returns; None if a newer call came before this one had its turn."""
+        with self._changed:
+            self._newest += 1
+            mine = self._newest
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._busy or mine != self._newest)
+            if mine != self._newest:
+                return None
+            self._busy = True
+        try:
+            return self._other_process().apply(self._function, arguments)  # type: ignore[no-any-return]
+        finally:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+
+    def _other_process(self) -> Any:
+        if self._process is None:
+            # Spawned, since the server has threads. Its end is that of the page's own process.
+            self._process = multiprocessing.get_context("spawn").Pool(1, _leave_signals)
+        return self._process
+
+    def close(self) -> None:
+        """End the other process, whatever it is at."""
+        if self._process is not None:
+            self._process.terminate()
+
+
+def _leave_signals() -> None:
+    """Ctrl-C reaches every process of the terminal, and is the page's own to act upon."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
