@@ -17,7 +17,7 @@ import pytest
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
 
-    from agv_analysis.run import Run
+    from agv_analysis.run import Floats, Run
 
 REPOSITORY = Path(__file__).parents[1]
 DOMAINS = range(1, 102)  # those that Linux' ephemeral ports leave free
@@ -54,6 +54,25 @@ hypothesis.settings.load_profile("agv_ncs")
 def _ros_home(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Logs of nodes go where the tests' other files go."""
     os.environ["ROS_HOME"] = str(tmp_path_factory.mktemp("ros_home"))
+
+
+Lap = Callable[..., tuple["Floats", "Floats", "Floats"]]
+
+
+@pytest.fixture(scope="session")
+def lap() -> Lap:
+    """Headings theta_r [rad] and speeds v_r [m/s], w_r [rad/s] of a track over a lap of `steps` steps of 5 ms."""
+
+    def reference(track: str, steps: int = 20_000) -> tuple[Floats, Floats, Floats]:
+        from agv_analysis.scenario import load_scenario
+        from agv_cloud.reference import Reference
+
+        settings = [f"error_detector.track={track}", f"error_detector.lap_time={steps * 0.005}"]
+        scenario = load_scenario(str(REPOSITORY / "config/paper.yaml"), settings)
+        rows = Reference(scenario.error_detector).first(steps)
+        return rows[:, 2], rows[:, 3], rows[:, 4]
+
+    return reference
 
 
 Drive = Callable[..., "Run"]

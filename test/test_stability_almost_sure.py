@@ -30,10 +30,6 @@ TS = 0.005
 Floats = NDArray[np.float64]
 
 
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-
-
 def constant(v: float, w: float = 0.0) -> tuple[Floats, Floats]:
     return np.array([v]), np.array([w])
 
@@ -101,8 +97,8 @@ def test_the_critical_loss_along_is_the_first_zero(a: float) -> None:
 
 def test_gains_that_do_not_contract_even_without_losses() -> None:
     assert (critical_loss_along(0.0), critical_loss_along(2.0), critical_loss_along(2.5)) == (-1.0, -1.0, -1.0)
-    assert critical_loss(*constant(1.0), gains(401.0), TS) == -1.0
-    assert critical_loss(*constant(1.0), gains(0.0), TS) == -1.0
+    assert critical_loss(*constant(1.0), ControllerParameters(kx=401.0), TS) == -1.0
+    assert critical_loss(*constant(1.0), ControllerParameters(kx=0.0), TS) == -1.0
 
 
 # -- all three errors ------------------------------------------------------------------------------------------------
@@ -126,15 +122,15 @@ def by_qr(v: float, w: float, by: ControllerParameters, p: float, steps: int, se
     ("v", "w", "kx", "p"), [(8.0, 0.0, 30.0, 0.5), (8.0, 3.0, 70.0, 0.6), (20.0, -1.0, 130.0, 0.4)]
 )
 def test_exponents_by_qr(v: float, w: float, kx: float, p: float) -> None:
-    found = exponents(*constant(v, w), gains(kx, 2.0, 3.0), TS, bernoulli(p), steps=200_000)
-    truth = by_qr(v, w, gains(kx, 2.0, 3.0), p, 40_000, 3)
+    found = exponents(*constant(v, w), ControllerParameters(kx=kx, ky=2.0, ktheta=3.0), TS, bernoulli(p), steps=200_000)
+    truth = by_qr(v, w, ControllerParameters(kx=kx, ky=2.0, ktheta=3.0), p, 40_000, 3)
     # The truth is five times shorter, so its own error is some sqrt(5) times as large.
     np.testing.assert_array_less(np.abs(found.values - truth), 5.0 * math.sqrt(6.0) * found.errors + 2e-4)
     assert found.errors.max() < 0.05
 
 
 def test_on_a_line_the_exponents_hold_the_one_along() -> None:
-    found = exponents(*constant(8.0), gains(70.0, 2.0, 3.0), TS, bursty(0.4, 2.5))
+    found = exponents(*constant(8.0), ControllerParameters(kx=70.0, ky=2.0, ktheta=3.0), TS, bursty(0.4, 2.5))
     truth = exponent_along(0.35, bursty(0.4, 2.5))
     nearest = int(np.abs(found.values - truth).argmin())
     assert abs(found.values[nearest] - truth) < 5.0 * found.errors[nearest]
@@ -142,7 +138,7 @@ def test_on_a_line_the_exponents_hold_the_one_along() -> None:
 
 @pytest.mark.parametrize("n", [0, 4])
 def test_periodic_losses_are_no_game_of_chance(n: int) -> None:
-    by = gains(70.0, 2.0, 3.0)
+    by = ControllerParameters(kx=70.0, ky=2.0, ktheta=3.0)
     F, G = (M[0] for M in step_matrices(*constant(8.0, 3.0), by, TS))
     M = np.eye(3)
     for _ in range(n + 1):
@@ -154,7 +150,7 @@ def test_periodic_losses_are_no_game_of_chance(n: int) -> None:
 
 
 def test_nothing_received() -> None:
-    found = exponents(*constant(1.0), gains(), TS, bernoulli(1.0), steps=1000)
+    found = exponents(*constant(1.0), ControllerParameters(), TS, bernoulli(1.0), steps=1000)
     assert found.values.tolist() == [0.0, 0.0, 0.0]
     assert np.isinf(found.errors).all()
 

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -27,21 +28,13 @@ from agv_analysis.stability.bursts import (
 )
 from agv_analysis.stability.linearisation import step_matrices
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference
+
+if TYPE_CHECKING:
+    from test.conftest import Lap
 
 CONFIG = str(Path(__file__).parents[1] / "config/paper.yaml")
 TS = 0.005
 Floats = NDArray[np.float64]
-
-
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-
-
-def lap(track: str, steps: int = 20_000) -> tuple[Floats, Floats]:
-    setting = [f"error_detector.track={track}", f"error_detector.lap_time={steps * TS}"]
-    reference = Reference(load_scenario(CONFIG, setting).error_detector).first(steps)
-    return reference[:, 3], reference[:, 4]
 
 
 def constant(v: float, w: float) -> tuple[Floats, Floats]:
@@ -61,8 +54,8 @@ def burst_map(F: Floats, G: Floats, first: int, length: int) -> Floats:
 
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
 @pytest.mark.parametrize(("kx", "last"), [(5.0, 78), (25.0, 14), (250.0, 0)])
-def test_the_canonical_scenario_whatever_the_track(track: str, kx: float, last: int) -> None:
-    assert largest_n(*lap(track), gains(kx), TS) == (last, last + 1)
+def test_the_canonical_scenario_whatever_the_track(lap: Lap, track: str, kx: float, last: int) -> None:
+    assert largest_n(*lap(track)[1:], ControllerParameters(kx=kx), TS) == (last, last + 1)
 
 
 def separation(track: str, kx: float, n: int, steps: int) -> float:
@@ -130,8 +123,8 @@ def test_the_marginal_burst_along_does_not_count() -> None:
 @settings(deadline=None, derandomize=True, max_examples=50)
 @given(st.floats(0.5, 30.0), st.floats(0.05, 20.0), st.floats(0.05, 20.0))
 def test_across_the_track_by_eigenvalues(v: float, ky: float, ktheta: float) -> None:
-    F, G = step_matrices(np.array([v]), np.zeros(1), gains(25.0, ky, ktheta), TS)
-    found = largest_n_across(v, gains(25.0, ky, ktheta), TS)
+    F, G = step_matrices(np.array([v]), np.zeros(1), ControllerParameters(kx=25.0, ky=ky, ktheta=ktheta), TS)
+    found = largest_n_across(v, ControllerParameters(kx=25.0, ky=ky, ktheta=ktheta), TS)
     assert found is not None
 
     def radius(n: int) -> float:
@@ -143,9 +136,9 @@ def test_across_the_track_by_eigenvalues(v: float, ky: float, ktheta: float) -> 
 
 
 def test_where_nothing_corrects_across() -> None:
-    assert largest_n_across(1.0, gains(25.0, 0.0, 2.0), TS) == -1
-    assert largest_n_across(1.0, gains(25.0, 1.0, 0.0), TS) == -1
-    assert largest_n_across(0.0, gains(), TS) == -1
+    assert largest_n_across(1.0, ControllerParameters(kx=25.0, ky=0.0, ktheta=2.0), TS) == -1
+    assert largest_n_across(1.0, ControllerParameters(kx=25.0, ky=1.0, ktheta=0.0), TS) == -1
+    assert largest_n_across(0.0, ControllerParameters(), TS) == -1
 
 
 # -- bounds and certificate ------------------------------------------------------------------------------------------
@@ -157,7 +150,7 @@ CASES = [(1.0, 0.0, 25.0, 1.0, 2.0, 12), (1.5, 0.6, 60.0, 4.0, 3.0, 4), (8.0, -2
 def test_the_certificate_is_a_norm_that_every_burst_shrinks(
     v: float, w: float, kx: float, ky: float, ktheta: float, n: int
 ) -> None:
-    by, (v_r, w_r) = gains(kx, ky, ktheta), constant(v, w)
+    by, (v_r, w_r) = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), constant(v, w)
     found = verdict(n, v_r, w_r, by, TS)
     assert found.verdict == STABLE
     P = found.certificate
@@ -177,7 +170,7 @@ def test_the_certificate_is_a_norm_that_every_burst_shrinks(
 @pytest.mark.parametrize(("v", "w", "kx", "ky", "ktheta", "n"), CASES)
 def test_no_sequence_leaves_the_bounds(v: float, w: float, kx: float, ky: float, ktheta: float, n: int) -> None:
     """All products of up to four bursts of five lengths: their radius per step is below the upper bound."""
-    by, (v_r, w_r) = gains(kx, ky, ktheta), constant(v, w)
+    by, (v_r, w_r) = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), constant(v, w)
     found, (F, G) = verdict(n, v_r, w_r, by, TS), step_matrices(v_r, w_r, by, TS)
     lengths = sorted({1, 2, (n + 1) // 2, n, n + 1})
     maps = {length: burst_map(F, G, 0, length) for length in lengths}
@@ -195,11 +188,11 @@ def test_no_sequence_leaves_the_bounds(v: float, w: float, kx: float, ky: float,
     )
 
 
-def test_speeds_that_change_inside_a_burst() -> None:
+def test_speeds_that_change_inside_a_burst(lap: Lap) -> None:
     """A lap of 60 steps with stops: random sequences of bursts, driven by hand, stay below the upper bound."""
-    v_r, w_r = lap("warehouse", 60)
+    v_r, w_r = lap("warehouse", 60)[1:]
     v_r = 10.0 * v_r
-    by, n = gains(20.0, 1.0, 2.0), 8
+    by, n = ControllerParameters(kx=20.0, ky=1.0, ktheta=2.0), 8
     found, (F, G) = verdict(n, v_r, w_r, by, TS), step_matrices(v_r, w_r, by, TS)
     assert found.verdict in (STABLE, UNDECIDED)
     random = np.random.default_rng(1)
@@ -217,7 +210,11 @@ def test_speeds_that_change_inside_a_burst() -> None:
 def test_the_lower_bound_drives_laps_whose_last_burst_is_cut_short(n: int) -> None:
     """Seven steps a lap: bursts of L steps from its first, the rest of 7 / L at its end."""
     random = np.random.default_rng(3)
-    v_r, w_r, by = random.uniform(0.0, 20.0, 7), random.uniform(-9.0, 9.0, 7), gains(80.0, 4.0, 3.0)
+    v_r, w_r, by = (
+        random.uniform(0.0, 20.0, 7),
+        random.uniform(-9.0, 9.0, 7),
+        ControllerParameters(kx=80.0, ky=4.0, ktheta=3.0),
+    )
     F, G = step_matrices(v_r, w_r, by, TS)
     radii = []
     for length in range(1, n + 2):
@@ -232,26 +229,28 @@ def test_the_lower_bound_drives_laps_whose_last_burst_is_cut_short(n: int) -> No
 
 @pytest.mark.parametrize("n", [16, 20])
 def test_an_unstable_verdict_names_a_burst_that_grows(n: int) -> None:
-    found = verdict(n, *constant(1.0, 0.0), gains(), TS)
+    found = verdict(n, *constant(1.0, 0.0), ControllerParameters(), TS)
     assert (found.verdict, found.worst, found.certificate) == (UNSTABLE, n, None)
     assert found.lower == pytest.approx(abs(1.0 - 0.125 * (n + 1)) ** (1.0 / (n + 1)), rel=1e-12)
 
 
 def test_a_parked_agv_is_judged_by_what_it_can_reach() -> None:
     stopped = np.zeros(10)
-    assert largest_n(stopped, stopped, gains(), TS) == (14, 15)
-    assert verdict(14, stopped, stopped, gains(), TS).certificate is not None
+    assert largest_n(stopped, stopped, ControllerParameters(), TS) == (14, 15)
+    assert verdict(14, stopped, stopped, ControllerParameters(), TS).certificate is not None
 
 
 def test_bursts_that_bring_the_error_to_nothing() -> None:
     """1 / a is an integer: for a parked AGV M_8 = 0 at a = 1/8, and M_1 = 0 at a = 1."""
     stopped = np.zeros(10)
-    assert verdict(7, stopped, stopped, gains(), TS).verdict == STABLE
-    found = verdict(0, stopped, stopped, gains(200.0), TS)
+    assert verdict(7, stopped, stopped, ControllerParameters(), TS).verdict == STABLE
+    found = verdict(0, stopped, stopped, ControllerParameters(kx=200.0), TS)
     assert (found.verdict, found.lower, found.upper) == (STABLE, 0.0, 0.0)
 
 
-def test_degenerate_gains() -> None:
-    assert largest_n(*lap("line"), gains(0.0), TS)[0] == -1  # what is off along the track stays off
-    assert largest_n(*lap("line"), gains(200.0), TS) == (0, 1)  # deadbeat
-    assert largest_n(*lap("line"), gains(401.0), TS) == (-1, 0)
+def test_degenerate_gains(lap: Lap) -> None:
+    assert (
+        largest_n(*lap("line")[1:], ControllerParameters(kx=0.0), TS)[0] == -1
+    )  # what is off along the track stays off
+    assert largest_n(*lap("line")[1:], ControllerParameters(kx=200.0), TS) == (0, 1)  # deadbeat
+    assert largest_n(*lap("line")[1:], ControllerParameters(kx=401.0), TS) == (-1, 0)

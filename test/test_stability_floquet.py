@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,21 +20,13 @@ from agv_analysis.stability.floquet import constant_delay, drop_sequence, larges
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.products import growths, log_spectral_radius, ordered_product
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference
+
+if TYPE_CHECKING:
+    from test.conftest import Lap
 
 CONFIG = str(Path(__file__).parents[1] / "config/paper.yaml")
 TS = 0.005
 Floats = NDArray[np.float64]
-
-
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-
-
-def lap(track: str, steps: int = 20_000) -> tuple[Floats, Floats]:
-    setting = [f"error_detector.track={track}", f"error_detector.lap_time={steps * TS}"]
-    reference = Reference(load_scenario(CONFIG, setting).error_detector).first(steps)
-    return reference[:, 3], reference[:, 4]
 
 
 # -- constant outdatedness -------------------------------------------------------------------------------------------
@@ -41,17 +34,21 @@ def lap(track: str, steps: int = 20_000) -> tuple[Floats, Floats]:
 
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
 @pytest.mark.parametrize(("kx", "last"), [(5.0, 62), (25.0, 12), (250.0, 0)])
-def test_the_canonical_scenario_whatever_the_track(track: str, kx: float, last: int) -> None:
-    v, w = lap(track)
-    assert largest_constant_delay(v, w, gains(kx), TS) == last
-    assert constant_delay(last, v, w, gains(kx), TS) < 0.0 < constant_delay(last + 1, v, w, gains(kx), TS)
+def test_the_canonical_scenario_whatever_the_track(lap: Lap, track: str, kx: float, last: int) -> None:
+    v, w = lap(track)[1:]
+    assert largest_constant_delay(v, w, ControllerParameters(kx=kx), TS) == last
+    assert (
+        constant_delay(last, v, w, ControllerParameters(kx=kx), TS)
+        < 0.0
+        < constant_delay(last + 1, v, w, ControllerParameters(kx=kx), TS)
+    )
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 7])
 @pytest.mark.parametrize("track", ["paper", "eight", "warehouse"])
-def test_a_short_lap_by_the_product_of_its_companions(track: str, n: int) -> None:
-    v, w = lap(track, 60)
-    v, by = 10.0 * v, gains(60.0, 2.0, 3.0)
+def test_a_short_lap_by_the_product_of_its_companions(lap: Lap, track: str, n: int) -> None:
+    v, w = lap(track, 60)[1:]
+    v, by = 10.0 * v, ControllerParameters(kx=60.0, ky=2.0, ktheta=3.0)
     F, G = step_matrices(v, w, by, TS)
     product = np.eye(3 * (n + 1))
     for k in range(60):
@@ -63,11 +60,11 @@ def test_a_short_lap_by_the_product_of_its_companions(track: str, n: int) -> Non
     assert constant_delay(n, v, w, by, TS) == pytest.approx(truth, abs=1e-6)
 
 
-def test_nothing_stable_and_everything_stable() -> None:
-    v, w = lap("paper", 400)
-    assert largest_constant_delay(v, w, gains(401.0), TS) == -1
-    assert largest_constant_delay(v, w, gains(1.0), TS, limit=20) is None
-    assert largest_constant_delay(0.0 * v, w, gains(0.0), TS) == -1
+def test_nothing_stable_and_everything_stable(lap: Lap) -> None:
+    v, w = lap("paper", 400)[1:]
+    assert largest_constant_delay(v, w, ControllerParameters(kx=401.0), TS) == -1
+    assert largest_constant_delay(v, w, ControllerParameters(kx=1.0), TS, limit=20) is None
+    assert largest_constant_delay(0.0 * v, w, ControllerParameters(kx=0.0), TS) == -1
 
 
 # -- a given sequence of losses --------------------------------------------------------------------------------------
@@ -87,10 +84,10 @@ def by_step(lost: NDArray[np.bool_], v: Floats, w: Floats, by: ControllerParamet
 
 @settings(deadline=None, derandomize=True, max_examples=30)
 @given(st.integers(0, 10_000), st.floats(0.0, 0.9), st.sampled_from(["paper", "eight", "warehouse"]))
-def test_random_sequences_by_step(seed: int, p: float, track: str) -> None:
-    v, w = lap(track, 80)
+def test_random_sequences_by_step(lap: Lap, seed: int, p: float, track: str) -> None:
+    v, w = lap(track, 80)[1:]
     lost = np.random.default_rng(seed).random(80) < p
-    by = gains(35.0, 2.0, 3.0)
+    by = ControllerParameters(kx=35.0, ky=2.0, ktheta=3.0)
     found, truth = drop_sequence(lost, 10.0 * v, w, by, TS), by_step(lost, 10.0 * v, w, by)
     if lost.all():
         assert found.tolist() == [0.0, 0.0, 0.0]
@@ -105,15 +102,17 @@ def test_on_a_line_a_sequence_is_a_product_of_numbers() -> None:
     lost = np.concatenate([[False] + [True] * (length - 1) for length in lengths])
     v, w = np.ones(len(lost)), np.zeros(len(lost))
     truth = sum(math.log(abs(1.0 - 0.125 * length)) for length in lengths)
-    assert np.abs(drop_sequence(lost, v, w, gains(), TS) - truth).min() < 1e-9
-    assert drop_sequence(lost, 0.0 * v, w, gains(), TS) == pytest.approx([truth], abs=1e-9)
-    deadbeat = drop_sequence(np.zeros(50, dtype=np.bool_), np.zeros(50), np.zeros(50), gains(200.0), TS)
+    assert np.abs(drop_sequence(lost, v, w, ControllerParameters(), TS) - truth).min() < 1e-9
+    assert drop_sequence(lost, 0.0 * v, w, ControllerParameters(), TS) == pytest.approx([truth], abs=1e-9)
+    deadbeat = drop_sequence(
+        np.zeros(50, dtype=np.bool_), np.zeros(50), np.zeros(50), ControllerParameters(kx=200.0), TS
+    )
     assert deadbeat.tolist() == [-math.inf]
 
 
 def test_nothing_received_is_an_open_loop() -> None:
     lost = np.ones(20, dtype=np.bool_)
-    assert drop_sequence(lost, np.ones(20), np.zeros(20), gains(), TS).tolist() == [0.0, 0.0, 0.0]
+    assert drop_sequence(lost, np.ones(20), np.zeros(20), ControllerParameters(), TS).tolist() == [0.0, 0.0, 0.0]
 
 
 # -- the motion that was driven --------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.lifted import (
     critical_delay_across,
     critical_delay_along,
@@ -23,20 +23,13 @@ from agv_analysis.stability.lifted import (
 )
 from agv_analysis.stability.linearisation import step_matrices
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference
+
+if TYPE_CHECKING:
+    from test.conftest import Lap
 
 CONFIG = str(Path(__file__).parents[1] / "config/paper.yaml")
 TS = 0.005
 Floats = NDArray[np.float64]
-
-
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-
-
-def lap(track: str) -> tuple[Floats, Floats]:
-    reference = Reference(load_scenario(CONFIG, [f"error_detector.track={track}"]).error_detector).first(20_000)
-    return reference[:, 3], reference[:, 4]
 
 
 def companion_moduli(n: int, v: float, w: float, by: ControllerParameters) -> Floats:
@@ -57,24 +50,27 @@ def companion_moduli(n: int, v: float, w: float, by: ControllerParameters) -> Fl
     st.floats(0.5, 300.0), st.floats(0.05, 20.0), st.floats(0.05, 20.0),
 )  # fmt: skip
 def test_the_block_companion_of_a_moving_agv(n: int, v: float, w: float, kx: float, ky: float, ktheta: float) -> None:
-    by = gains(kx, ky, ktheta)
+    by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
     assert spectral_radius(n, v, w, by, TS) == pytest.approx(companion_moduli(n, v, w, by)[0], abs=2e-7)
 
 
 @pytest.mark.parametrize("n", [0, 3, 14, 40])
 @pytest.mark.parametrize(("w", "neutral"), [(0.0, 2), (0.7, 1)])
 def test_a_parked_agv_without_what_it_cannot_reach(n: int, w: float, neutral: int) -> None:
-    moduli = companion_moduli(n, 0.0, w, gains())
+    moduli = companion_moduli(n, 0.0, w, ControllerParameters())
     others = sorted(np.delete(moduli, np.argsort(np.abs(moduli - 1.0))[:neutral]))
-    assert spectral_radius(n, 0.0, w, gains(), TS) == pytest.approx(others[-1], abs=1e-7)
+    assert spectral_radius(n, 0.0, w, ControllerParameters(), TS) == pytest.approx(others[-1], abs=1e-7)
 
 
 @pytest.mark.parametrize(("n", "kx"), [(30, 5.0), (31, 12.0), (20, 250.0)])
 def test_many_speeds_at_once(n: int, kx: float) -> None:
     v, w = (np.array(values) for values in ([0.5, 1.0, 1.5, 1.0, 3.0], [0.0, 0.12, -0.1, 2.0, 0.5]))
-    truth = [companion_moduli(n, *speeds, gains(kx))[0] for speeds in zip(v.tolist(), w.tolist(), strict=True)]
-    np.testing.assert_allclose(spectral_radii(n, v, w, gains(kx), TS), truth, atol=1e-9)
-    assert largest_radius(n, v, w, gains(kx), TS) == pytest.approx(max(truth), abs=1e-9)
+    truth = [
+        companion_moduli(n, *speeds, ControllerParameters(kx=kx))[0]
+        for speeds in zip(v.tolist(), w.tolist(), strict=True)
+    ]
+    np.testing.assert_allclose(spectral_radii(n, v, w, ControllerParameters(kx=kx), TS), truth, atol=1e-9)
+    assert largest_radius(n, v, w, ControllerParameters(kx=kx), TS) == pytest.approx(max(truth), abs=1e-9)
 
 
 def zeros_inside(radius: float, n: int, v: float, w: float, by: ControllerParameters) -> int:
@@ -91,9 +87,9 @@ def zeros_inside(radius: float, n: int, v: float, w: float, by: ControllerParame
 @pytest.mark.parametrize(("v", "w", "kx"), [(1.0, 0.0, 0.3), (1.0, 0.0, 5.0), (1.4, 0.12, 25.0), (0.6, -0.5, 0.6)])
 def test_n_500_by_counting_zeros(v: float, w: float, kx: float) -> None:
     """All 1503 multipliers lie within a circle a little larger than the radius, not all in one a little smaller."""
-    radius = spectral_radius(500, v, w, gains(kx), TS)
-    assert zeros_inside(radius + 1e-5, 500, v, w, gains(kx)) == 1503
-    assert zeros_inside(radius - 1e-5, 500, v, w, gains(kx)) < 1503
+    radius = spectral_radius(500, v, w, ControllerParameters(kx=kx), TS)
+    assert zeros_inside(radius + 1e-5, 500, v, w, ControllerParameters(kx=kx)) == 1503
+    assert zeros_inside(radius - 1e-5, 500, v, w, ControllerParameters(kx=kx)) < 1503
 
 
 # -- borders ---------------------------------------------------------------------------------------------------------
@@ -101,23 +97,23 @@ def test_n_500_by_counting_zeros(v: float, w: float, kx: float) -> None:
 
 @pytest.mark.parametrize(("kx", "last"), [(5.0, 62), (25.0, 12), (250.0, 0)])
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight"])
-def test_the_canonical_scenario(track: str, kx: float, last: int) -> None:
-    v, w = lap(track)
-    assert largest_n(v, w, gains(kx), TS) == last
+def test_the_canonical_scenario(lap: Lap, track: str, kx: float, last: int) -> None:
+    v, w = lap(track)[1:]
+    assert largest_n(v, w, ControllerParameters(kx=kx), TS) == last
     if track != "paper":
         return
     fastest = int(np.argmax(np.abs(v) + np.abs(w)))
-    assert companion_moduli(last, float(v[fastest]), float(w[fastest]), gains(kx))[0] < 1.0
-    assert companion_moduli(last + 1, float(v[fastest]), float(w[fastest]), gains(kx))[0] > 1.0
+    assert companion_moduli(last, float(v[fastest]), float(w[fastest]), ControllerParameters(kx=kx))[0] < 1.0
+    assert companion_moduli(last + 1, float(v[fastest]), float(w[fastest]), ControllerParameters(kx=kx))[0] > 1.0
 
 
-def test_a_sharp_corner_held_for_ever_allows_one_step_less() -> None:
+def test_a_sharp_corner_held_for_ever_allows_one_step_less(lap: Lap) -> None:
     """In the corners of the warehouse a pose that is 62 steps old is too old, by the companion matrix, too."""
-    v, w = lap("warehouse")
-    assert [largest_n(v, w, gains(kx), TS) for kx in (5.0, 25.0, 250.0)] == [61, 12, 0]
+    v, w = lap("warehouse")[1:]
+    assert [largest_n(v, w, ControllerParameters(kx=kx), TS) for kx in (5.0, 25.0, 250.0)] == [61, 12, 0]
     sharpest = int(np.argmax(w))
-    assert companion_moduli(61, float(v[sharpest]), float(w[sharpest]), gains(5.0))[0] < 1.0
-    assert companion_moduli(62, float(v[sharpest]), float(w[sharpest]), gains(5.0))[0] > 1.0
+    assert companion_moduli(61, float(v[sharpest]), float(w[sharpest]), ControllerParameters(kx=5.0))[0] < 1.0
+    assert companion_moduli(62, float(v[sharpest]), float(w[sharpest]), ControllerParameters(kx=5.0))[0] > 1.0
 
 
 @settings(deadline=None, derandomize=True, max_examples=60)
@@ -138,7 +134,7 @@ def test_along_the_track_by_the_roots_of_a_polynomial(a: float) -> None:
 @given(st.floats(0.5, 30.0), st.floats(0.1, 20.0), st.floats(0.3, 20.0))
 def test_across_the_track_by_the_roots_of_a_polynomial(v: float, ky: float, ktheta: float) -> None:
     """z^n (z - 1)^2 + b (z - 1) + c; across a straight track, b = T_s v K_theta and c = T_s^2 v^2 K_y."""
-    delay = critical_delay_across(v, gains(25.0, ky, ktheta), TS)
+    delay = critical_delay_across(v, ControllerParameters(kx=25.0, ky=ky, ktheta=ktheta), TS)
     b, c = TS * v * ktheta, TS * TS * v * v * ky
 
     def largest(n: int) -> float:
@@ -158,19 +154,19 @@ def test_across_the_track_by_the_roots_of_a_polynomial(v: float, ky: float, kthe
     ("kx", "ky", "ktheta", "v"), [(2.0, 4.0, 3.0, 4.0), (1.0, 20.0, 5.0, 8.0), (30.0, 1.0, 9.0, 6.0)]
 )
 def test_whichever_of_along_and_across_binds(kx: float, ky: float, ktheta: float, v: float) -> None:
-    by = gains(kx, ky, ktheta)
+    by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
     last = next(n for n in itertools.count() if companion_moduli(n, v, 0.0, by)[0] >= 1.0) - 1
     assert largest_n(np.array([v]), np.zeros(1), by, TS) == last
     assert last == math.floor(min(critical_delay_along(TS * kx), critical_delay_across(v, by, TS)))
 
 
-def test_degenerate_gains_and_speeds() -> None:
-    v, w = lap("line")
-    assert largest_n(v, w, gains(0.0), TS) == -1  # what is off along the track stays off
-    assert largest_n(v, w, gains(200.0), TS) == 0  # deadbeat: a = 1 is on the border of n = 1
-    assert largest_n(v, w, gains(401.0), TS) == -1
-    assert largest_n(v, w, gains(25.0, 0.0), TS) == -1  # nothing corrects across
-    assert largest_n(0.0 * v, w, gains(), TS) == 12  # parked: along is all that it can reach
+def test_degenerate_gains_and_speeds(lap: Lap) -> None:
+    v, w = lap("line")[1:]
+    assert largest_n(v, w, ControllerParameters(kx=0.0), TS) == -1  # what is off along the track stays off
+    assert largest_n(v, w, ControllerParameters(kx=200.0), TS) == 0  # deadbeat: a = 1 is on the border of n = 1
+    assert largest_n(v, w, ControllerParameters(kx=401.0), TS) == -1
+    assert largest_n(v, w, ControllerParameters(kx=25.0, ky=0.0), TS) == -1  # nothing corrects across
+    assert largest_n(0.0 * v, w, ControllerParameters(), TS) == 12  # parked: along is all that it can reach
     assert critical_delay_along(1.0) == pytest.approx(1.0)
     assert (critical_delay_along(0.0), critical_delay_along(2.0)) == (0.0, 0.0)
-    assert critical_delay_across(0.0, gains(), TS) == math.inf
+    assert critical_delay_across(0.0, ControllerParameters(), TS) == math.inf

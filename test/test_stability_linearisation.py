@@ -28,10 +28,6 @@ TS = 0.005
 Floats = NDArray[np.float64]
 
 
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0, v_max: float = math.inf) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta, v_max=v_max)
-
-
 def off_by(reference: State, error: Floats) -> State:
     """The posture that sees the reference at `error` in its own frame: the tracking error turned round."""
     x_e, y_e, theta_e = error.tolist()
@@ -54,7 +50,7 @@ def next_error(now: Floats, outdated: Floats, v: float, w: float, by: Controller
     st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(0.0, 300.0), st.floats(0.0, 20.0), st.floats(0.0, 20.0)
 )  # fmt: skip
 def test_f_and_g_by_finite_differences(v: float, w: float, kx: float, ky: float, ktheta: float) -> None:
-    by, h, zero = gains(kx, ky, ktheta), 1e-5, np.zeros(3)
+    by, h, zero = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), 1e-5, np.zeros(3)
     F, G = (M[0] for M in step_matrices(np.array([v]), np.array([w]), by, TS))
     assert not next_error(zero, zero, v, w, by).any() or np.abs(next_error(zero, zero, v, w, by)).max() < 1e-14
     for column, unit in enumerate(h * np.eye(3)):
@@ -67,9 +63,9 @@ def test_f_and_g_by_finite_differences(v: float, w: float, kx: float, ky: float,
 def test_the_shapes_follow_the_speeds() -> None:
     """Row k belongs to the speeds of step k, all speeds at once as one by one."""
     v, w = np.array([1.0, 0.5, 0.0]), np.array([0.0, 0.2, -0.4])
-    F, G = step_matrices(v, w, gains(), TS)
+    F, G = step_matrices(v, w, ControllerParameters(), TS)
     for k in range(3):
-        F_k, G_k = step_matrices(v[k : k + 1], w[k : k + 1], gains(), TS)
+        F_k, G_k = step_matrices(v[k : k + 1], w[k : k + 1], ControllerParameters(), TS)
         np.testing.assert_array_equal((F[k], G[k]), (F_k[0], G_k[0]))
 
 
@@ -86,7 +82,7 @@ def step(pose: Floats, held: Floats, reference: Floats, by: ControllerParameters
 
 @pytest.mark.parametrize("v_max", [math.inf, 6.0])
 def test_derivatives_of_the_loop_far_from_its_reference(v_max: float) -> None:
-    random, by, h = np.random.default_rng(8), gains(8.0, 1.5, 2.5, v_max), 1e-6
+    random, by, h = np.random.default_rng(8), ControllerParameters(kx=8.0, ky=1.5, ktheta=2.5, v_max=v_max), 1e-6
     pose, held = random.uniform(-2.0, 2.0, (2, 60, 3))
     reference = random.uniform(-2.0, 2.0, (60, 5))
     now, outdated = loop_jacobians(pose, held, reference, by, TS)
@@ -108,8 +104,10 @@ def test_a_of_the_paper_is_their_sum_at_zero_error() -> None:
     random = np.random.default_rng(9)
     held = random.uniform(-2.0, 2.0, (40, 3))
     pose, speeds = random.uniform(-2.0, 2.0, (40, 3)), random.uniform(-2.0, 2.0, (40, 2))
-    now, outdated = loop_jacobians(pose, held, np.hstack((held, speeds)), gains(), TS)
-    np.testing.assert_allclose(now + outdated, matrices(pose[:, 2], held[:, 2], speeds[:, 0], gains(), TS), atol=1e-14)
+    now, outdated = loop_jacobians(pose, held, np.hstack((held, speeds)), ControllerParameters(), TS)
+    np.testing.assert_allclose(
+        now + outdated, matrices(pose[:, 2], held[:, 2], speeds[:, 0], ControllerParameters(), TS), atol=1e-14
+    )
 
 
 # -- from one reception to the next ----------------------------------------------------------------------------------
@@ -124,7 +122,12 @@ def driven(F: Floats, G: Floats, first: int, length: int) -> Floats:
 
 def a_lap(steps: int) -> tuple[Floats, Floats]:
     random = np.random.default_rng(4)
-    return step_matrices(random.uniform(0.0, 20.0, steps), random.uniform(-9.0, 9.0, steps), gains(80.0, 4.0, 3.0), TS)
+    return step_matrices(
+        random.uniform(0.0, 20.0, steps),
+        random.uniform(-9.0, 9.0, steps),
+        ControllerParameters(kx=80.0, ky=4.0, ktheta=3.0),
+        TS,
+    )
 
 
 def test_maps_of_bursts_that_run_over_the_end_of_the_lap() -> None:
@@ -135,7 +138,7 @@ def test_maps_of_bursts_that_run_over_the_end_of_the_lap() -> None:
 
 def test_at_constant_speeds_they_are_a_power_and_a_sum() -> None:
     """M_L = F^L + sum of F^i G over i < L; along a line 1 - a L."""
-    F, G = step_matrices(np.ones(1), np.zeros(1), gains(), TS)
+    F, G = step_matrices(np.ones(1), np.zeros(1), ControllerParameters(), TS)
     for length, M in enumerate(burst_maps(F, G, 30), start=1):
         truth = np.linalg.matrix_power(F[0], length)
         truth = truth + sum(np.linalg.matrix_power(F[0], i) @ G[0] for i in range(length))
@@ -160,7 +163,7 @@ def test_maps_between_given_receptions(steps: set[int], beyond: int) -> None:
 @pytest.mark.parametrize(("v", "w"), [(1.0, 0.0), (0.0, 0.3), (0.0, 0.0), (-1.0, 0.2)])
 def test_reach_is_the_rank_of_what_commands_do(v: float, w: float) -> None:
     """Rank of (B, F B, F^2 B), where B holds the columns by which v and w - w_r move the error where gains act."""
-    F, G = (M[0] for M in step_matrices(np.array([v]), np.array([w]), gains(), TS))
+    F, G = (M[0] for M in step_matrices(np.array([v]), np.array([w]), ControllerParameters(), TS))
     rank = np.linalg.matrix_rank(np.hstack((G, F @ G, F @ F @ G)), tol=1e-12)
     assert reachable(np.array([v]), np.array([w])) == rank
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.chain import Chain, bernoulli, bursty, gilbert_elliott
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.mean_square import (
@@ -27,21 +27,13 @@ from agv_analysis.stability.mean_square import (
     spectral_radius,
 )
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference
+
+if TYPE_CHECKING:
+    from test.conftest import Lap
 
 CONFIG = str(Path(__file__).parents[1] / "config/paper.yaml")
 TS = 0.005
 Floats = NDArray[np.float64]
-
-
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-
-
-def lap(track: str, steps: int = 20_000) -> tuple[Floats, Floats]:
-    setting = [f"error_detector.track={track}", f"error_detector.lap_time={steps * TS}"]
-    reference = Reference(load_scenario(CONFIG, setting).error_detector).first(steps)
-    return reference[:, 3], reference[:, 4]
 
 
 def straight(v: float = 1.0) -> tuple[Floats, Floats]:
@@ -73,7 +65,12 @@ def moments_by_enumeration(F: Floats, G: Floats, chain: Chain, steps: int) -> Fl
 )
 @pytest.mark.parametrize(("v", "w"), [(1.0, 0.0), (12.0, -3.0)])
 def test_the_recursion_is_the_mean_over_all_sequences(chain: Chain, steps: int, v: float, w: float) -> None:
-    F, G = (matrices[0] for matrices in step_matrices(np.array([v]), np.array([w]), gains(150.0, 4.0, 3.0), TS))
+    F, G = (
+        matrices[0]
+        for matrices in step_matrices(
+            np.array([v]), np.array([w]), ControllerParameters(kx=150.0, ky=4.0, ktheta=3.0), TS
+        )
+    )
     size, states = 3, len(chain.delivery)
     start = np.kron(np.ones((2, 1)), np.eye(size))
     moments = np.concatenate([share * (start @ start.T).ravel() for share in chain.stationary])
@@ -86,9 +83,9 @@ def test_the_recursion_is_the_mean_over_all_sequences(chain: Chain, steps: int, 
 
 
 @pytest.mark.parametrize("chain", [bernoulli(0.6), bernoulli(0.93), bursty(0.3, 4.0)])
-def test_driving_a_lap_is_the_product_of_its_operators(chain: Chain) -> None:
-    v, w = lap("paper", 30)
-    by = gains(60.0, 4.0, 3.0)
+def test_driving_a_lap_is_the_product_of_its_operators(lap: Lap, chain: Chain) -> None:
+    v, w = lap("paper", 30)[1:]
+    by = ControllerParameters(kx=60.0, ky=4.0, ktheta=3.0)
     F, G = step_matrices(12.0 * v, w, by, TS)
     product = np.eye(36 * len(chain.delivery))
     for k in range(30):
@@ -98,7 +95,10 @@ def test_driving_a_lap_is_the_product_of_its_operators(chain: Chain) -> None:
 
 
 def test_without_losses_it_is_the_square_of_the_loop() -> None:
-    F, G = (M[0] for M in step_matrices(np.array([2.0]), np.array([0.4]), gains(60.0, 4.0, 3.0), TS))
+    F, G = (
+        M[0]
+        for M in step_matrices(np.array([2.0]), np.array([0.4]), ControllerParameters(kx=60.0, ky=4.0, ktheta=3.0), TS)
+    )
     square = np.abs(np.linalg.eigvals(F + G)).max() ** 2
     assert spectral_radius(F, G, bernoulli(0.0)) == pytest.approx(square, rel=1e-9)
 
@@ -141,9 +141,11 @@ def test_periodic_bursts_contract_if_each_factor_does(n: int) -> None:
 
 @pytest.mark.parametrize(("kx", "p"), [(5.0, 0.97531), (25.0, 0.88235), (250.0, 0.23077)])
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
-def test_the_canonical_scenario(track: str, kx: float, p: float) -> None:
-    v, w = lap(track, 2000) if track in ("eight", "warehouse") else lap(track)
-    assert critical_loss(v, w, gains(kx), TS) == pytest.approx(p, abs=2e-5 if len(v) == 20_000 else 2e-3)
+def test_the_canonical_scenario(lap: Lap, track: str, kx: float, p: float) -> None:
+    v, w = lap(track, 2000)[1:] if track in ("eight", "warehouse") else lap(track)[1:]
+    assert critical_loss(v, w, ControllerParameters(kx=kx), TS) == pytest.approx(
+        p, abs=2e-5 if len(v) == 20_000 else 2e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -151,7 +153,7 @@ def test_the_canonical_scenario(track: str, kx: float, p: float) -> None:
 )
 def test_the_critical_loss_is_where_the_operator_has_radius_one(kx: float, ky: float, ktheta: float, v: float) -> None:
     """Also where it is across the track that the moments grow."""
-    by = gains(kx, ky, ktheta)
+    by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
     p = critical_loss(*straight(v), by, TS)
     assert 0.0 < p <= critical_loss_along(TS * kx) + 1e-8
     F, G = (matrices[0] for matrices in step_matrices(*straight(v), by, TS))
@@ -162,7 +164,7 @@ def test_the_critical_loss_is_where_the_operator_has_radius_one(kx: float, ky: f
 @pytest.mark.parametrize(("loss_rate", "kx"), [(0.3, 5.0), (0.6, 5.0), (0.05, 25.0), (0.3, 25.0), (0.6, 25.0)])
 def test_the_critical_burst_on_a_line(loss_rate: float, kx: float) -> None:
     """pi B = 1/a - 1/2."""
-    found = critical_burst(loss_rate, *straight(), gains(kx), TS)
+    found = critical_burst(loss_rate, *straight(), ControllerParameters(kx=kx), TS)
     assert found * loss_rate == pytest.approx(1.0 / (TS * kx) - 0.5, rel=1e-5)
 
 
@@ -176,7 +178,7 @@ def growth_per_reception(F: Floats, G: Floats, lengths: Floats) -> float:
 
 
 def test_the_example_of_the_docs() -> None:
-    assert critical_burst(0.05, *straight(), gains(5.0), TS) == pytest.approx(346.5, abs=0.1)
+    assert critical_burst(0.05, *straight(), ControllerParameters(kx=5.0), TS) == pytest.approx(346.5, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -186,8 +188,8 @@ def test_the_example_of_the_docs() -> None:
 def test_the_critical_burst_by_renewals(loss_rate: float, kx: float, v: float, w: float) -> None:
     """Where bursts are long and rare the error across binds, because it grows with the square of their length."""
     speeds = np.array([v]), np.array([w])
-    found = critical_burst(loss_rate, *speeds, gains(kx), TS)
-    F, G = (matrices[0] for matrices in step_matrices(*speeds, gains(kx), TS))
+    found = critical_burst(loss_rate, *speeds, ControllerParameters(kx=kx), TS)
+    F, G = (matrices[0] for matrices in step_matrices(*speeds, ControllerParameters(kx=kx), TS))
     assert growth_per_reception(F, G, bursty(loss_rate, 0.999 * found).burst_lengths()) < 1.0
     assert growth_per_reception(F, G, bursty(loss_rate, 1.001 * found).burst_lengths()) > 1.0
     along = found * loss_rate == pytest.approx(1.0 / (TS * kx) - 0.5, rel=1e-5)
@@ -195,12 +197,12 @@ def test_the_critical_burst_by_renewals(loss_rate: float, kx: float, v: float, w
 
 
 def test_degenerate_cases() -> None:
-    assert critical_loss(*straight(), gains(200.0), TS) == pytest.approx(1.0 / 3.0)  # deadbeat
-    assert critical_loss(*straight(), gains(401.0), TS) == -1.0
-    assert critical_loss(*straight(), gains(0.0), TS) == -1.0
-    assert critical_loss(*straight(0.0), gains(), TS) == pytest.approx(15.0 / 17.0)  # parked
-    assert critical_burst(0.3, *straight(), gains(401.0), TS) == -1.0
-    assert critical_burst(0.9, *straight(), gains(250.0), TS) == -1.0  # 0.9 needs bursts of 9 slots
+    assert critical_loss(*straight(), ControllerParameters(kx=200.0), TS) == pytest.approx(1.0 / 3.0)  # deadbeat
+    assert critical_loss(*straight(), ControllerParameters(kx=401.0), TS) == -1.0
+    assert critical_loss(*straight(), ControllerParameters(kx=0.0), TS) == -1.0
+    assert critical_loss(*straight(0.0), ControllerParameters(), TS) == pytest.approx(15.0 / 17.0)  # parked
+    assert critical_burst(0.3, *straight(), ControllerParameters(kx=401.0), TS) == -1.0
+    assert critical_burst(0.9, *straight(), ControllerParameters(kx=250.0), TS) == -1.0  # 0.9 needs bursts of 9 slots
     assert (critical_loss_along(0.0), critical_loss_along(2.0)) == (-1.0, -1.0)
     assert (critical_mean_age_along(0.0), critical_mean_age_along(2.0)) == (-1.0, -1.0)
     assert along_spectral_radius(0.5, bernoulli(1.0)) >= 1.0  # nothing is ever received

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,20 +20,12 @@ from agv_cloud.reference import Reference
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.unicycle import euler_step
 
+if TYPE_CHECKING:
+    from test.conftest import Lap
+
 CONFIG = str(Path(__file__).parents[1] / "config/paper.yaml")
 TS = 0.005
 Floats = NDArray[np.float64]
-
-
-def gains(kx: float = 25.0, ky: float = 1.0, ktheta: float = 2.0) -> ControllerParameters:
-    return ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-
-
-def lap(track: str, steps: int = 20_000) -> tuple[Floats, Floats]:
-    """Heading and speed of a track's reference over a lap of `steps` steps."""
-    setting = [f"error_detector.track={track}", f"error_detector.lap_time={steps * TS}"]
-    reference = Reference(load_scenario(CONFIG, setting).error_detector).first(steps)
-    return reference[:, 2], reference[:, 3]
 
 
 def step(pose: Floats, held: Floats, reference: Floats, by: ControllerParameters) -> Floats:
@@ -52,7 +45,7 @@ angle, speed = st.floats(-4.0, 4.0), st.floats(-3.0, 3.0)
 def test_a_is_the_sum_of_both_derivatives_of_the_loop_at_zero_error(
     theta: float, held: float, v: float, kx: float, ky: float, ktheta: float
 ) -> None:
-    by = gains(kx, ky, ktheta)
+    by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
     now, then = np.array([3.0, -2.0, theta]), np.array([1.0, 2.0, held])
     reference = np.array([*then, v, 0.3])
     h = 1e-5
@@ -74,7 +67,7 @@ def test_spectral_radii_are_those_of_numpy(literal: bool) -> None:
     v = random.uniform(0.0, 3.0, shape) * (random.random(shape) > 0.05)
     nu = random.uniform(-30.0, 30.0, shape) if literal else None
     for kx, ky, ktheta in [(5.0, 1.0, 2.0), (25.0, 1.0, 2.0), (250.0, 30.0, 1.0), (200.0, 0.0, 2.0), (0.0, 5.0, 0.0)]:
-        by = gains(kx, ky, ktheta)
+        by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
         truth = np.abs(np.linalg.eigvals(matrices(theta, held, v, by, TS, nu))).max(axis=1)
         error = np.abs(spectral_radii(theta, held, v, by, TS, nu) - truth)
         assert np.quantile(error, 0.9) < 1e-12
@@ -83,7 +76,9 @@ def test_spectral_radii_are_those_of_numpy(literal: bool) -> None:
 
 def test_the_printed_form_differs_in_one_entry() -> None:
     theta, held, v, nu = (np.array([value]) for value in (0.4, 0.1, 1.5, -24.5))
-    difference = matrices(theta, held, v, gains(), TS, nu) - matrices(theta, held, v, gains(), TS)
+    difference = matrices(theta, held, v, ControllerParameters(), TS, nu) - matrices(
+        theta, held, v, ControllerParameters(), TS
+    )
     assert difference[0, 2, 1] == pytest.approx(-TS * np.cos(0.1) * (-24.5 - 1.5))
     difference[0, 2, 1] = 0.0
     assert not difference.any()
@@ -101,41 +96,45 @@ def holds(n: int, theta: Floats, v: Floats, by: ControllerParameters) -> bool:
 
 @pytest.mark.parametrize("kx", [5.0, 25.0, 250.0])
 @pytest.mark.parametrize("track", ["paper", "circle", "eight"])
-def test_on_a_curve_the_last_n_holds_and_the_next_does_not(track: str, kx: float) -> None:
-    theta, v = lap(track)
-    found = largest_n(theta, v, gains(kx), TS)
+def test_on_a_curve_the_last_n_holds_and_the_next_does_not(lap: Lap, track: str, kx: float) -> None:
+    theta, v = lap(track)[:2]
+    found = largest_n(theta, v, ControllerParameters(kx=kx), TS)
     assert found is not None
     assert found > (1800 if track == "eight" else 2000)
-    assert holds(found, theta, v, gains(kx))
-    assert not holds(found + 1, theta, v, gains(kx))
+    assert holds(found, theta, v, ControllerParameters(kx=kx))
+    assert not holds(found + 1, theta, v, ControllerParameters(kx=kx))
 
 
 @pytest.mark.parametrize("track", ["paper", "eight"])
 @pytest.mark.parametrize("kx", [5.0, 150.0, 390.0])
-def test_a_short_lap_against_every_n(track: str, kx: float) -> None:
-    theta, v = lap(track, 240)
-    broken = next((n for n in range(240) if not holds(n, theta, v, gains(kx, 1.0, 2.0))), None)
-    found = largest_n(theta, v, gains(kx, 1.0, 2.0), TS)
+def test_a_short_lap_against_every_n(lap: Lap, track: str, kx: float) -> None:
+    theta, v = lap(track, 240)[:2]
+    broken = next(
+        (n for n in range(240) if not holds(n, theta, v, ControllerParameters(kx=kx, ky=1.0, ktheta=2.0))), None
+    )
+    found = largest_n(theta, v, ControllerParameters(kx=kx, ky=1.0, ktheta=2.0), TS)
     assert found == (None if broken is None else broken - 1)
 
 
 @pytest.mark.parametrize("kx", [5.0, 25.0, 250.0])
-def test_on_a_line_it_is_blind(kx: float) -> None:
-    assert largest_n(*lap("line"), gains(kx), TS) is None
+def test_on_a_line_it_is_blind(lap: Lap, kx: float) -> None:
+    assert largest_n(*lap("line")[:2], ControllerParameters(kx=kx), TS) is None
 
 
-def test_a_parked_agv_fails_it_at_once() -> None:
+def test_a_parked_agv_fails_it_at_once(lap: Lap) -> None:
     """At v_r = 0 an eigenvalue is 1, whatever the gains."""
-    assert spectral_radii(np.array([0.3]), np.array([0.3]), np.zeros(1), gains(), TS)[0] == 1.0
-    assert largest_n(*lap("warehouse"), gains(), TS) == -1
+    assert spectral_radii(np.array([0.3]), np.array([0.3]), np.zeros(1), ControllerParameters(), TS)[0] == 1.0
+    assert largest_n(*lap("warehouse")[:2], ControllerParameters(), TS) == -1
 
 
 def test_deadbeat_passes_it() -> None:
     """K_x = 1 / T_s has the eigenvalue 0, which the printed 0 < |lambda| would refuse."""
     theta = np.array([np.pi / 2])
-    values = np.linalg.eigvals(matrices(theta, theta, np.ones(1), gains(200.0), TS)[0])
+    values = np.linalg.eigvals(matrices(theta, theta, np.ones(1), ControllerParameters(kx=200.0), TS)[0])
     assert np.abs(values).min() < 1e-15
-    assert spectral_radii(theta, theta, np.ones(1), gains(200.0), TS)[0] == pytest.approx(0.995, abs=1e-7)
+    assert spectral_radii(theta, theta, np.ones(1), ControllerParameters(kx=200.0), TS)[0] == pytest.approx(
+        0.995, abs=1e-7
+    )
 
 
 # -- the counterexample ----------------------------------------------------------------------------------------------
@@ -152,12 +151,12 @@ def end_of_line(n: int, steps: int, by: ControllerParameters) -> float:
 
 def test_a_loop_that_diverges_although_every_eigenvalue_is_inside() -> None:
     theta = np.full(1, np.pi / 2)
-    values = np.linalg.eigvals(matrices(theta, theta, np.ones(1), gains(), TS)[0])
+    values = np.linalg.eigvals(matrices(theta, theta, np.ones(1), ControllerParameters(), TS)[0])
     assert sorted(np.abs(values)) == pytest.approx([0.875, 0.995, 0.995], abs=1e-7)
-    assert end_of_line(13, 4000, gains()) == pytest.approx(
+    assert end_of_line(13, 4000, ControllerParameters()) == pytest.approx(
         2.526e5, rel=1e-3
     )  # p(k+1) = p(k) + T_s [v_r + K_x (r(k) - p(k-13))]
-    assert end_of_line(11, 4000, gains()) < 0.06  # it settles n T_s v_r = 0.055 m ahead
+    assert end_of_line(11, 4000, ControllerParameters()) < 0.06  # it settles n T_s v_r = 0.055 m ahead
 
 
 # -- the table of the docs -------------------------------------------------------------------------------------------
@@ -180,7 +179,9 @@ def test_the_table_of_the_docs(track: str) -> None:
         [kx, *row] for kx, row in zip(("5", "25", "250"), others, strict=True)
     ]
     for _, kx, of_paper, *_, p_almost_surely in rows:
-        assert largest_n(theta, v, gains(float(kx)), TS) == (None if of_paper == "all" else int(of_paper))
+        assert largest_n(theta, v, ControllerParameters(kx=float(kx)), TS) == (
+            None if of_paper == "all" else int(of_paper)
+        )
         if (track, kx) in (("paper", "25"), ("paper", "250"), ("line", "25"), ("line", "250")):
-            found = almost_sure.critical_loss(v, w, gains(float(kx)), TS)
+            found = almost_sure.critical_loss(v, w, ControllerParameters(kx=float(kx)), TS)
             assert found == pytest.approx(float(p_almost_surely), abs=2e-3)
