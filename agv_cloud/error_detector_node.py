@@ -36,7 +36,7 @@ from agv_ros.wire import (
     Slot,
     TrackingError,
     decode_command,
-    decode_error,
+    decode_odometry,
     decode_pose,
     decode_slot,
     encode_error,
@@ -100,7 +100,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         return Prediction(STEPS[self.settings.integration], self.settings.ts)
 
     def _decode_pose(self, data: bytes) -> Pose:
-        return Pose(*decode_error(data)[:4]) if self._is_odometry else decode_pose(data)
+        return decode_odometry(data) if self._is_odometry else decode_pose(data)
 
     # -- by slots ----------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from agv_cloud.staleness import POLICIES
 from agv_cloud.tracks import TRACKS
 from agv_plant.unicycle import STEPS
-from agv_ros.message_types import POSE_TYPES
+from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES
 from agv_ros.parameters import LoopParameters, ParameterError, parameter
 
 TRIGGERS = ("slot", "timer")
@@ -70,4 +70,10 @@ class ControllerParameters(LoopParameters):
     kx: float = parameter(25.0, "gain K_x of the error along the track", unit="1/s", low=0.0, high=1e6, runtime=True)
     ky: float = parameter(1.0, "gain K_y of the error across the track", unit="1/m^2", low=0.0, high=1e6, runtime=True)
     ktheta: float = parameter(2.0, "gain K_theta of the error of heading", unit="1/m", low=0.0, high=1e6, runtime=True)
+    command_type: str = parameter(
+        "twist_stamped",
+        "type of edge/cmd_vel; twist_stamped: geometry_msgs/TwistStamped, twist: geometry_msgs/Twist, which without a "
+        "stamp cannot pass the relay or tell a predicting edge",
+        choices=COMMAND_TYPES,
+    )
     v_max: float = parameter(math.inf, "limit on |v|, .inf: none", unit="m/s", above=0.0, high=math.inf, runtime=True)

@@ -198,6 +198,11 @@ def encode_command(command: Command, prefix: str = "") -> bytes:
     return _LITTLE + layout.pack(*_split(command.stamp_ns), len(frame), frame, command.v, 0.0, 0.0, 0.0, 0.0, command.w)
 
 
+def encode_twist(command: Command) -> bytes:
+    """geometry_msgs/Twist: the command without stamp and frame."""
+    return _LITTLE + struct.pack("<6d", command.v, 0.0, 0.0, 0.0, 0.0, command.w)
+
+
 def decode_command(data: bytes) -> Command:
     """geometry_msgs/TwistStamped. Raises InvalidMessageError."""
     order = _order(data)
@@ -234,6 +239,11 @@ def decode_error(data: bytes) -> TrackingError:
     sec, nanosec, _, _, _, _, x, y, _, qx, qy, qz, qw, v, _, _, _, _, w = values
     _finite("tracking error", (x, y, v, w))
     return TrackingError(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("tracking error", qx, qy, qz, qw), v, w)
+
+
+def decode_odometry(data: bytes) -> Pose:
+    """nav_msgs/Odometry, the pose in it; theta in (-pi, pi]. Raises InvalidMessageError."""
+    return Pose(*decode_error(data)[:4])
 
 
 def encode_slot(slot: Slot) -> bytes:

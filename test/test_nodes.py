@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import signal
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
@@ -24,6 +25,7 @@ from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
 from agv_plant.relay_node import RelayNode
+from agv_plant.unicycle import arc_step
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS, LoopNode
@@ -349,6 +351,94 @@ def test_a_clock_that_cannot_be_the_run_s_is_said(bench: Bench) -> None:
     poses.publish(late)
     bench.until(lambda: detector.finished)
     assert "start_time = 1 s: set it, or set error_detector.begin to first_pose" in detector.failure
+
+
+# -- somebody else's robot ---------------------------------------------------------------------------------------------
+
+
+class Robot(Node):
+    """Stands in for a robot behind diff_drive_controller, with its conventions and a clock that is not ours.
+
+    Odometry in frame `odom` every 20 ms; commands stamped, or not; it halts when the newest is older than 0.5 s by its
+    clock, or has come from the future, and takes one without a stamp for one of now. Source: ros2_controllers,
+    diff_drive_controller (Jazzy), parameters cmd_vel_timeout and use_stamped_vel.
+    """
+
+    PERIOD = 0.02
+    TIMEOUT_NS = 500_000_000
+    CLOCK_AHEAD_NS = 3_000_000_000
+
+    def __init__(self, context: Any, is_stamped: bool) -> None:
+        super().__init__("robot", context=context, use_global_arguments=False)
+        self.x = self.y = self.theta = 0.0
+        self._command = (0, 0.0, 0.0)
+        self.halts = self.driven = 0
+        self._odometry = self.create_publisher(Odometry, "diff_drive_controller/odom", 10)
+        kind, take = (TwistStamped, self._take_stamped) if is_stamped else (Twist, self._take)
+        self.create_subscription(kind, "diff_drive_controller/cmd_vel", take, 10)
+        self.create_timer(self.PERIOD, self._move)
+
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds) + self.CLOCK_AHEAD_NS
+
+    def _take_stamped(self, command: TwistStamped) -> None:
+        stamp_ns = stamp_ns_of(command.header.stamp) or self._now_ns()
+        self._command = (stamp_ns, command.twist.linear.x, command.twist.angular.z)
+
+    def _take(self, command: Twist) -> None:
+        self._command = (self._now_ns(), command.linear.x, command.angular.z)
+
+    def _move(self) -> None:
+        stamp_ns, v, w = self._command
+        if not 0 <= self._now_ns() - stamp_ns <= self.TIMEOUT_NS:
+            v = w = 0.0
+            self.halts += 1
+        else:
+            self.driven += 1
+        self.x, self.y, self.theta = arc_step(self.x, self.y, self.theta, v, w, self.PERIOD)
+        message = Odometry()
+        message.header.frame_id, message.child_frame_id = "odom", "base_link"
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._now_ns(), 1_000_000_000)
+        message.pose.pose.position.x, message.pose.pose.position.y = self.x, self.y
+        message.pose.pose.orientation.z = math.sin(0.5 * self.theta)
+        message.pose.pose.orientation.w = math.cos(0.5 * self.theta)
+        message.twist.twist.linear.x, message.twist.twist.angular.z = v, w
+        self._odometry.publish(message)
+
+
+EDGE_OF_A_ROBOT = {"ts": 0.02, "track": "line", "speed": 0.2, "track_start": [0.0, 0.3, 0.0]}
+ROBOT_S_TOPICS = ["-r", "edge/pose:=diff_drive_controller/odom", "-r", "edge/cmd_vel:=diff_drive_controller/cmd_vel"]
+
+
+@pytest.mark.parametrize("command_type", ["twist_stamped", "twist"])
+def test_the_edge_drives_a_robot_that_is_not_ours_and_it_halts_without_the_edge(
+    bench: Bench, command_type: str
+) -> None:
+    robot = Robot(bench.context, command_type == "twist_stamped")
+    bench.executor.add_node(robot)
+    bench.nodes.append(robot)
+    remapped = {"cli_args": ["--ros-args", *ROBOT_S_TOPICS]}
+    controller = bench.add(
+        functools.partial(ControllerNode, **remapped), ts=0.02, command_type=command_type, kx=2.0, ky=60.0, ktheta=15.0,
+        v_max=1.0,
+    )  # fmt: skip
+    detector = bench.add(
+        functools.partial(ErrorDetectorNode, **remapped), trigger="timer", begin="first_pose", pose_type="odometry",
+        **EDGE_OF_A_ROBOT,
+    )  # fmt: skip
+    errors = bench.received(Odometry, "edge/error")
+    bench.until(lambda: robot.driven > 50 and abs(robot.y - 0.3) < 0.02)  # it has found the line 0.3 m beside it
+    bench.until(lambda: abs(errors[-1].pose.pose.position.x) < 0.1)  # and goes along with the reference
+    assert robot.x > 0.0
+    assert controller.rejected == detector.rejected == {}
+    # The edge's clock minus the robot's, plus the least delay: some 3 s behind.
+    assert float(detector.facts()["clock offset"]) >= -3.0
+    bench.executor.remove_node(controller)
+    halts = robot.halts
+    bench.until(lambda: robot.halts > halts + 5)
+    stands_at = robot.x
+    bench.until(lambda: robot.halts > halts + 10)
+    assert robot.x == stands_at
 
 
 # -- real time --------------------------------------------------------------------------------------------------------
