@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -281,3 +283,28 @@ def test_progress_ends_at_a_hundred(tmp_path: Path) -> None:
     read_bag(tmp_path / "bag.mcap", progress=shares.append)
     assert shares == sorted(shares)
     assert shares[-1] <= 100
+
+
+WITHOUT_ISAL = """
+import sys
+sys.modules["isal"] = None
+from agv_analysis.bags import read_bag
+bag = read_bag(sys.argv[1])
+print(bag.problems, sum(len(rows) for rows in bag.arrays.values()))
+"""
+
+
+@pytest.mark.parametrize("damage", [0, 1])
+def test_without_isal_checksums_are_compared_all_the_same(tmp_path: Path, damage: int) -> None:
+    path = tmp_path / "bag.mcap"
+    write_mcap(path, enable_data_crcs=True)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= damage
+    path.write_bytes(data)
+    bag = read_bag(path)
+    expected = f"{bag.problems} {sum(len(rows) for rows in bag.arrays.values())}\n"
+    assert bag.is_complete == (not damage)
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_ISAL, str(path)], capture_output=True, text=True, check=True, cwd=REPOSITORY
+    )
+    assert done.stdout == expected
