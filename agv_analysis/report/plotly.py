@@ -33,7 +33,7 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, revision: str = "")
     rows = len(panels)
     traces: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
-        "margin": {"l": 60, "r": 12, "t": 8, "b": 44},
+        "margin": {"l": 60, "r": 12, "t": 32, "b": 44},
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "modebar": {"bgcolor": "rgba(0,0,0,0)"},

@@ -83,7 +83,7 @@ def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
     layout = {
         "xaxis": {"title": {"text": across.label}}, "yaxis": {"title": {"text": up.label}},
         "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 60, "r": 12, "t": 8, "b": 44},
+        "margin": {"l": 60, "r": 12, "t": 32, "b": 44},
         "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
     }  # fmt: skip
     return {"data": [{**heat, "colorscale": "Viridis"}, *_borders(sweep, across, up)], "layout": layout}
