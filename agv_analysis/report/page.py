@@ -37,20 +37,34 @@ def sentence(analysis: Observations) -> str:
         return "This recording proves nothing: messages are missing that no channel lost."
     if not isinstance(analysis, Analysis):
         return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
-    longest = f"{analysis.n} lost updates in a row ({analysis.n * analysis.run.ts * 1e3:g} ms)"
-    word = analysis.verdict.word
+    word, met = analysis.verdict.word, _met(analysis)
     if word == ASYMPTOTIC and analysis.n == 0:
         return "The AGV keeps to its track; no update was lost."
+    if word == ASYMPTOTIC and _is_late(analysis):
+        return f"The AGV keeps to its track with {met}."
     if word == ASYMPTOTIC:
-        return f"The AGV keeps to its track, whatever the order of outages as long as those seen: up to {longest}."
+        return f"The AGV keeps to its track under {met}, or shorter ones, in any order."
     if word == MEAN_SQUARE:
         return (
-            f"The AGV keeps to its track on a radio link like this one, but not in every case: outages of {longest}, "
-            "again and again, would throw it off."
+            f"The AGV keeps to its track on a radio link like this one, but not in every case: {met}, again and again, "
+            "would throw it off."
         )
     if word == BOUNDED:
-        return f"The AGV does not settle on its track under outages of {longest}; only its speed limit keeps it near."
-    return f"The AGV does not keep to its track: outages of {longest} are too long for these gains."
+        return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
+    return f"The AGV does not keep to its track: {met} are too much for these gains."
+
+
+def _is_late(analysis: Observations) -> bool:
+    """Were poses older than outages make them? Messages were delayed, then."""
+    return analysis.n > analysis.outages.uplink.longest
+
+
+def _met(analysis: Observations) -> str:
+    """The worst that the run has met."""
+    age = f"{analysis.n * analysis.run.ts * 1e3:g} ms"
+    if _is_late(analysis):
+        return f"poses up to {analysis.n} steps ({age}) old"
+    return f"outages of {analysis.n} lost updates in a row ({age})"
 
 
 def write_report(analysis: Observations, path: Path) -> None:
