@@ -70,7 +70,7 @@ class Observations:
             "source": run.source,
             "steps": len(run),
             "ts": run.ts,
-            "seed": run.scenario.relay.seed if run.gains_known else None,
+            "seed": run.scenario.relay.seed if run.seed_known else None,
             "valid": not run.unexplained,
             "unexplained": dict(run.unexplained),
             "notes": list(run.notes),

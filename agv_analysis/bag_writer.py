@@ -19,6 +19,9 @@ from agv_ros.errors import UserError
 METADATA_NAME = "agv_ncs"
 """Name of the MCAP metadata record that holds the run's version, seed and parameters."""
 
+REPLAY_OF = "replay_of"
+"""Key in it that names the recording, if the edge answered to that instead of an AGV."""
+
 _WINDOW = 1024
 """Messages that are held back to be ordered."""
 

@@ -126,6 +126,7 @@ def _run(
             *command_notes,
         ),
         gains_known=config is not None,
+        seed_known=False,
     )
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bag_writer import METADATA_NAME
+from agv_analysis.bag_writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.convergence import body_errors, wrapped
 from agv_analysis.run import Floats, Run
@@ -19,7 +19,7 @@ from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S, Grid
-from agv_ros.wire import DELIVERED, yaw_of_quaternion
+from agv_ros.wire import DELIVERED, SQUARED_LENGTH, yaw_of_quaternion
 
 Steps = NDArray[np.int64]
 
@@ -28,6 +28,9 @@ TOPICS = (
 )  # fmt: skip
 
 _NEEDED = ("agv/pose", "edge/slot", "edge/error", "edge/cmd_vel")
+
+_NUMBERS = ("position.x", "position.y", "linear.x", "angular.z")
+"""Ends of the paths of all numbers that are used, but for those of quaternions."""
 
 _SAME_ERROR = 1e-6
 """Largest difference [m, rad] between a recorded tracking error and the one that follows from track and pose."""
@@ -81,6 +84,7 @@ class OnSteps(NamedTuple):
     messages: NDArray[np.void]
     off_grid: int
     repeated: int
+    unusable: int = 0
 
     def at(self, k: Steps) -> tuple[Steps, NDArray[np.bool_]]:
         """Index of the message of each of the steps `k`, and whether there is one (else the index means nothing)."""
@@ -108,14 +112,30 @@ def _stamps(messages: NDArray[np.void], field: str) -> Steps:
 
 def _on_steps(messages: NDArray[np.void], grid: Grid) -> OnSteps:
     k, rest = np.divmod(_stamps(messages, "header.stamp") - grid.start_ns, grid.ts_ns)
-    on_grid = (rest == 0) & (k >= 0)
-    first_k, first = np.unique(k[on_grid], return_index=True)
+    on_grid, usable = (rest == 0) & (k >= 0), _usable(messages)
+    taken = on_grid & usable
+    first_k, first = np.unique(k[taken], return_index=True)
     return OnSteps(
         k=first_k,
-        messages=messages[on_grid][first],
+        messages=messages[taken][first],
         off_grid=int(np.count_nonzero(~on_grid)),
-        repeated=int(np.count_nonzero(on_grid)) - len(first),
+        repeated=int(np.count_nonzero(taken)) - len(first),
+        unusable=int(np.count_nonzero(on_grid & ~usable)),
     )
+
+
+def _usable(messages: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Which messages are such as a node takes: their numbers are finite, their quaternions have length one; (N,)."""
+    usable = np.ones(len(messages), dtype=np.bool_)
+    for name in messages.dtype.names or ():
+        if name.endswith(_NUMBERS):
+            usable &= np.isfinite(messages[name])
+        elif name.endswith("orientation.x"):
+            turn = name.removesuffix("x")
+            with np.errstate(over="ignore", invalid="ignore"):
+                squared = sum(messages[f"{turn}{axis}"] ** 2 for axis in "xyzw")
+            usable &= np.abs(squared - 1.0) < SQUARED_LENGTH
+    return usable
 
 
 def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Run:
@@ -148,7 +168,9 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         unexplained=unexplained(on_steps, scenario.grid),
     )
     unknown = () if knows or not scenario.plant.is_noisy else (_NO_TRUTH,)
-    return dataclasses.replace(run, notes=(*bag.problems, *_notes(on_steps, names), *_mismatch(run), *unknown))
+    return dataclasses.replace(
+        run, notes=(*bag.problems, *_replayed(bag), *_notes(on_steps, names), *_mismatch(run), *unknown)
+    )
 
 
 def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.bool_]]:
@@ -223,10 +245,18 @@ def _where(messages: OnSteps, condition: Callable[[NDArray[np.void]], NDArray[np
     return messages.k[condition(messages.messages)]
 
 
+def _replayed(bag: Bag) -> Iterator[str]:
+    source = bag.metadata.get(METADATA_NAME, {}).get(REPLAY_OF)
+    if source is not None:
+        yield f"a replay of {source}: errors and commands are new, but the AGV moves as it did there, whatever they are"
+
+
 def _notes(on_steps: Mapping[str, OnSteps], names: Mapping[str, str]) -> Iterator[str]:
     for topic, messages in on_steps.items():
         if messages.off_grid:
             yield f"{names[topic]}: {messages.off_grid} messages are no sampling instant's, they are left out"
+        if messages.unusable:
+            yield f"{names[topic]}: {messages.unusable} messages with numbers that no node takes, they are left out"
         if messages.repeated:
             yield f"{names[topic]}: {messages.repeated} messages repeat a step, the first of each counts"
 

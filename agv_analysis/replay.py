@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import read_bag
 from agv_analysis.convergence import wrapped
-from agv_analysis.recording import loop_topics
+from agv_analysis.recording import TOPICS, loop_topics
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, parse_scenario
 from agv_analysis.simulation.loop import answer, at_rest, received
@@ -190,6 +190,9 @@ def with_outages_of(run: Run, scenario: Scenario, folder: Path) -> Scenario:
 
 # -- what came to the edge --------------------------------------------------------------------------------------------
 
+BEYOND = tuple(topic for topic in TOPICS if topic.startswith("agv/"))
+"""The loop's topics on the AGV's side of the radio."""
+
 
 class Input(NamedTuple):
     """What the edge got in one slot, as it came over the wire."""
@@ -198,14 +201,18 @@ class Input(NamedTuple):
     stamp_ns: int
     slot: bytes
     pose: bytes | None
-    """The pose that the relay forwarded, None if it was lost."""
+    """The fresher pose that came in this slot, None if none did."""
     is_answered: bool
     """Does an edge that knows this recording alone hold the pose that the slot names?"""
+    beyond: tuple[tuple[str, bytes], ...] = ()
+    """What the recording holds of the step on the AGV's side of the radio, by topic."""
 
 
 class EdgeInputs(NamedTuple):
     """All that came to the edge, by increasing step."""
 
+    source: str
+    """The recording."""
     namespace: str
     slots: tuple[Input, ...]
 
@@ -222,7 +229,12 @@ def read_inputs(path: Path, grid: Grid, namespace: str | None = None) -> EdgeInp
     poses, slots = (_by_step(bag.payloads(names[topic]), grid) for topic in ("edge/pose", "edge/slot"))
     if not slots:
         raise UserError(f"{path}: no slot of {names['edge/slot']} is one of the parameters' sampling instants")
-    return EdgeInputs(names["edge/slot"].removesuffix("edge/slot").strip("/"), tuple(inputs_of(slots, poses, grid)))
+    beyond = {topic: _by_step(bag.payloads(names[topic]), grid) for topic in BEYOND if topic in names}
+    inputs = tuple(
+        slot._replace(beyond=tuple((topic, data[slot.k]) for topic, data in beyond.items() if slot.k in data))
+        for slot in inputs_of(slots, poses, grid)
+    )
+    return EdgeInputs(str(path), names["edge/slot"].removesuffix("edge/slot").strip("/"), inputs)
 
 
 def _by_step(payloads: Iterable[bytes], grid: Grid) -> dict[int, bytes]:
@@ -236,16 +248,22 @@ def _by_step(payloads: Iterable[bytes], grid: Grid) -> dict[int, bytes]:
 
 
 def inputs_of(slots: Mapping[int, bytes], poses: Mapping[int, bytes], grid: Grid) -> Iterator[Input]:
-    """What the edge gets in each slot, from slots and forwarded poses by increasing step; damaged slots are dropped."""
+    """What the edge gets in each slot, from slots and forwarded poses by increasing step; damaged slots are dropped.
+
+    A pose comes in the first slot that names it as the freshest: a late one in the slot of its arrival.
+    """
     sent: set[int] = set()
+    stamps = {grid.stamp(k): k for k in poses}
     for k, data in slots.items():
         try:
             slot = decode_slot(data)
         except InvalidMessageError:
             continue
-        if k in poses:
-            sent.add(grid.stamp(k))
-        yield Input(k, slot.stamp_ns, data, poses.get(k), slot.freshest_ns in sent)
+        freshest, pose = slot.freshest_ns, None
+        if freshest not in sent and freshest in stamps:
+            pose = poses[stamps[freshest]]
+            sent.add(freshest)
+        yield Input(k, slot.stamp_ns, data, pose, freshest in sent)
 
 
 def on_steps(

@@ -44,6 +44,8 @@ class Run:
     """The poses that the AGV measured and sent, shape (N, 3), where they are not the true ones; see `sent_pose`."""
     gains_known: bool = True
     """Are the gains and limits in `scenario.controller` those of the run? Else they mean nothing."""
+    seed_known: bool = True
+    """Were the losses drawn from `scenario.relay.seed`? Those of a real radio come from none."""
 
     @property
     def sent_pose(self) -> Floats:

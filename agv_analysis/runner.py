@@ -27,19 +27,21 @@ from rclpy.signals import SignalHandlerOptions
 from agv_analysis.parameters import RecorderParameters
 from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.replay import EdgeInputs
-from agv_analysis.replay_node import Pace, ReplayNode
+from agv_analysis.replay_node import Pace, ReplayNode, ReplayRecorder
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode, progress_of
 from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
+from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, Stop, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
 from agv_ros.parameters import LoopParameters, as_dict
 from agv_ros.wire import Command, TrackingError
 
 N = TypeVar("N", bound=LoopNode[Any])
+R = TypeVar("R", bound=RecorderNode)
 
 NODES: dict[str, Callable[..., LoopNode[Any]]] = {
     "plant": PlantNode,
@@ -103,7 +105,7 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
         plant = process.add(PlantNode, connected.plant)
         rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # its Outcome says the same
         loop = [plant, *(process.add(NODES[name], getattr(connected, name)) for name in SCHEMAS if name != "plant")]
-        recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params))
+        recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params), RecorderNode)
         return run_nodes(EXECUTORS[executor](context=process.context), plant, loop, recorder, stop, progress)
 
 
@@ -118,15 +120,22 @@ def replay_in_process(
     listeners = {"error_detector": 2 + recorded, "controller": 1 + predicts + recorded}
     with stop_on_signals() as stop, _params_file(scenario) as params, OneProcess(inputs.namespace) as process:
         player = process.add(
-            partial(ReplayNode, inputs, pace),
+            partial(ReplayNode, inputs, pace, not starts_edge),
             LoopParameters(scenario.plant.ts, scenario.plant.start_time, 1 + recorded),
         )
         nodes: list[LoopNode[Any]] = [player]
         for name, count in listeners.items() if starts_edge else ():
-            settings = dataclasses.replace(getattr(scenario, name), wait_for_subscribers=count)
+            only = {"trigger": "slot"} if name == "error_detector" else {"command_type": "twist_stamped"}
+            given = getattr(scenario, name)
+            settings = dataclasses.replace(given, wait_for_subscribers=count, plan_steps=0, **only)
             nodes.append(process.add(NODES[name], settings, use_sim_time=True))
-        recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params))
-        outcome = run_nodes(EXECUTORS["events"](context=process.context), player, nodes, recorder, stop, progress)
+        if bag is not None:
+            own = [node.get_fully_qualified_name().lstrip("/") for node in nodes]
+            make = partial(ReplayRecorder, inputs.source, own)
+            player.recorder = process.add_recorder(_recording(scenario, bag, params), make)
+            player.recorder.player = player
+        executor = EXECUTORS["events"](context=process.context)
+        outcome = run_nodes(executor, player, nodes, player.recorder, stop, progress)
         return outcome, player.errors, player.commands
 
 
@@ -155,10 +164,10 @@ class OneProcess:
         self._stack.callback(node.destroy_node)
         return node
 
-    def add_recorder(self, settings: RecorderParameters) -> RecorderNode:
+    def add_recorder(self, settings: RecorderParameters, make: Callable[..., R]) -> R:
         """Make a recorder, which says in the run's Outcome alone what it has recorded."""
         rclpy.logging.set_logger_level("recorder", rclpy.logging.LoggingSeverity.WARN)
-        return self.add(RecorderNode, settings)
+        return self.add(make, settings)
 
 
 def run_nodes(
@@ -199,13 +208,21 @@ def run_nodes(
 
 
 def _connected(scenario: Scenario, recorded: bool) -> Scenario:
-    """The scenario with nodes that wait for each other, and for the recorder. Raises TraceError as the nodes would."""
+    """The scenario with nodes that wait for each other, and for the recorder.
+
+    Raises TraceError as the nodes would, and UserError if they would wait for ever.
+    """
+    if scenario.error_detector.trigger == "timer" and scenario.plant.clock == "lockstep":
+        raise UserError(
+            "error_detector.trigger is timer, but plant.clock is lockstep, in which the plant waits for an answer to "
+            "each of its steps: set plant.clock=realtime"
+        )
     steps = scenario.plant.duration / scenario.plant.ts
     for channel in (scenario.relay.uplink, scenario.relay.downlink):
         check_length(channel, steps)
     met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": _PATIENCE if recorded else scenario.plant.stop_timeout}
     nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
-    if scenario.error_detector.policy == "predict":  # which listens to the controller's commands as well
+    if scenario.error_detector.policy == "predict" and not scenario.plant.plan_steps:  # which hears commands as well
         nodes["controller"] = dataclasses.replace(nodes["controller"], wait_for_subscribers=2 + recorded)
     return Scenario(**nodes)
 

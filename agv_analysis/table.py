@@ -55,7 +55,7 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     """Name and value of each figure, as text with rich's markup."""
     run, up = analysis.run, analysis.outages.uplink
     ms = 1e3 * run.ts
-    seed = f", seed {run.scenario.relay.seed}" if run.gains_known else ""
+    seed = f", seed {run.scenario.relay.seed}" if run.seed_known else ""
     yield "Run", f"{len(run)} steps of {ms:g} ms{seed}"
     yield "Uplink", f"{up.loss_rate:.2%} lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
     yield "Longest outage", f"{up.longest} slots ({up.longest * ms:g} ms)"

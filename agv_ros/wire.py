@@ -35,6 +35,9 @@ FRAME_REFERENCE = "reference"
 DELIVERED = "delivered"
 LOST = "lost"
 
+SQUARED_LENGTH = 0.01
+"""How far the squared length of a rotation's quaternion may be from one."""
+
 _HEADER = 4
 _MAX_STRING = 4096
 
@@ -131,7 +134,7 @@ def _finite(what: str, values: tuple[float, ...]) -> None:
 
 def _yaw(what: str, x: float, y: float, z: float, w: float) -> float:
     norm = x * x + y * y + z * z + w * w
-    if not abs(norm - 1.0) < 0.01:
+    if not abs(norm - 1.0) < SQUARED_LENGTH:
         raise InvalidMessageError(f"{what} has a quaternion of squared length {norm!r}, must be 1")
     return yaw_of_quaternion(x, y, z, w)
 

@@ -328,6 +328,7 @@ def test_with_gains_the_verdict_is_that_of_the_simulated_run(tmp_path: Path, tru
     assert found["verdict"] == expected["verdict"]
     assert found["no_verdict_because"] is None
     assert found["lifted_radius"] == pytest.approx(expected["lifted_radius"], rel=1e-6)
+    assert found["seed"] is None, "the seed of a params file has not drawn the losses of a real radio"
     assert set(found) == set(expected) == set(observe(truth).to_json())
 
 

@@ -30,8 +30,11 @@ def ordered_product(factors: Floats) -> tuple[Floats, float]:
 
 
 def log_spectral_radius(factors: Floats) -> float:
-    """Logarithm of the spectral radius of `ordered_product`; -inf for a nilpotent one."""
-    product, log_scale = ordered_product(factors)
+    """Logarithm of the spectral radius of `ordered_product`; -inf for a nilpotent one, inf beyond a double's range."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        product, log_scale = ordered_product(factors)
+    if not np.isfinite(product).all():
+        return np.inf
     radius = float(np.abs(np.linalg.eigvals(product)).max())
     return log_scale + float(np.log(radius)) if radius > 0.0 else -np.inf
 
