@@ -7,6 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
+from copy import copy
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -32,6 +33,7 @@ from agv_ros.wire import InvalidMessageError, encode_diagnostics, stamp_of
 P = TypeVar("P", bound=LoopParameters)
 
 # Deep enough that a reader which falls behind for a moment, the recorder above all, still gets every message.
+# Only copies of it are used: rclpy writes a topic's overrides into the profile that it is given.
 LOOP_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 _POLL_PERIOD = 0.01
@@ -99,7 +101,7 @@ class LoopNode(Node, Generic[P]):
     def output(self, kind: type, topic: str, *, side: bool = False) -> Output:
         """Publisher of serialised messages of type `kind`; `side`: no node of the loop listens to it."""
         publisher = self.create_publisher(
-            kind, topic, LOOP_QOS, qos_overriding_options=QoSOverridingOptions.with_default_policies()
+            kind, topic, copy(LOOP_QOS), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
         self.outputs.append(Output(publisher, side))
         return self.outputs[-1]
@@ -123,7 +125,7 @@ class LoopNode(Node, Generic[P]):
             if not all(output.is_heard(self.settings.wait_for_subscribers) for output in feeds):
                 return False
             self.create_subscription(
-                kind, topic, receive, LOOP_QOS, raw=True,
+                kind, topic, receive, copy(LOOP_QOS), raw=True,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )  # fmt: skip
             return True
