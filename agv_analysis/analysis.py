@@ -15,7 +15,7 @@ from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
 from agv_analysis.stability.linearisation import Edge
 from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED
-from agv_analysis.stability.verdict import Verdict, judge
+from agv_analysis.stability.verdict import Verdict, judge, judge_late
 from agv_ros.errors import UserError
 
 
@@ -195,19 +195,37 @@ def analyse(run: Run) -> Analysis:
     of_drops, of_motion = _contractions(run, edge)
     longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
     n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
+    radius = _lifted_radius(out.n_ul_max, v_r, w_r, run, edge)
+    verdict = (
+        judge_late(_constant_delay(run), radius, gains.v_max)
+        if _is_late(run)
+        else judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max)
+    )
     return Analysis(
         run=run,
         outages=out,
         convergence=convergence(run),
         paper=paper_test(run),
-        lifted_radius=_lifted_radius(out.n_ul_max, v_r, w_r, run, edge),
+        lifted_radius=radius,
         bursts=bursts.verdict(out.n_ul_max, v_r, w_r, gains, run.ts, edge),
         fit=fit,
         mean_square_growth=growth,
         floquet=of_drops,
         contraction=of_motion,
-        verdict=judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max),
+        verdict=verdict,
     )
+
+
+def _is_late(run: Run) -> bool:
+    """Did messages arrive in a later slot than their own?"""
+    return any(link is not None and bool(link.delay.any()) for link in (run.uplink, run.downlink))
+
+
+def _constant_delay(run: Run) -> int | None:
+    """Age of the pose in slots, if it is always the same, but for the beginning, and commands are there at once."""
+    n = int(run.n_ul.max())
+    is_direct = not run.downlink_lost.any() and (run.downlink is None or not run.downlink.delay.any())
+    return n if is_direct and np.array_equal(run.n_ul, np.minimum(run.k, n)) else None
 
 
 def _lifted_radius(n: int, v_r: Floats, w_r: Floats, run: Run, edge: Edge) -> float:
@@ -229,7 +247,7 @@ def _contractions(run: Run, edge: Edge) -> tuple[float | None, float | None]:
     """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
     first = int(np.argmin(run.lost))
     steps = len(run) - first
-    if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
+    if _is_late(run) or run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
         return None, None
     lost, reference, gains = run.lost[first:], run.reference[first:], run.scenario.controller
     policy = run.scenario.error_detector.policy

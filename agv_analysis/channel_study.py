@@ -10,20 +10,35 @@ import csv
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from agv_analysis.channel_fit import ChannelFit, fit_channel
+from agv_analysis.compiled import compiled, numbers
 from agv_analysis.outages import LinkOutages, Steps, Verdicts, ages, link_outages
 from agv_analysis.run import Floats
+from agv_analysis.simulation.on_air import blank, listen
 from agv_analysis.simulation.verdicts import Air
 from agv_analysis.stability.chain import Chain, chain_of
+from agv_plant.channels.rayleigh import fades_per_metre, loss_rate
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
 
 DRAWN = 1000
 """Slots that the picture shows one by one."""
+
+
+class Expected(NamedTuple):
+    """What theory says of a channel; None where it says nothing."""
+
+    loss_rate: float | None = None
+    mean_burst: float | None = None
+    mean_age: float | None = None
+
+
+_SHORTEST_FADE = 3.0
+"""Mean length of a fade in slots from which on theory, which knows no slots, says how long an outage is."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +53,23 @@ class ChannelStudy:
     outages: LinkOutages
     chain: Chain | None
     """The channel as a Markov chain; None if it is none."""
+    late: float = 0.0
+    """Share of the messages that are not lost and come in a later slot than their own."""
+    way: float = 0.0
+    """Length of the way that the AGV went [m]."""
+
+    @property
+    def expected(self) -> Expected:
+        """What theory says of the channel."""
+        c = self.channel
+        if self.chain is not None:
+            age = self.chain.mean_age if not c.delays and math.isfinite(self.chain.mean_age) else None
+            return Expected(self.chain.loss_rate, self.chain.mean_burst, age)
+        if c.model == "rayleigh" and not c.schedule:
+            fades, rate = fades_per_metre(c.carrier, c.margin) * self.way, loss_rate(c.margin)
+            lasts = rate * len(self.lost) / fades if fades > 0.0 else 0.0
+            return Expected(rate, lasts if lasts > _SHORTEST_FADE else None)
+        return Expected()
 
     @property
     def fit(self) -> ChannelFit:
@@ -51,12 +83,14 @@ class ChannelStudy:
 
     @property
     def expected_age_shares(self) -> Floats | None:
-        """P(n_ul = j) in closed form, as long as `age_shares`; None for a channel that is no Markov chain."""
-        return None if self.chain is None else age_distribution(self.chain, len(self.age_shares))
+        """P(n_ul = j) in closed form, as long as `age_shares`; None for late messages and what is no Markov chain."""
+        if self.chain is None or self.channel.delays:
+            return None
+        return age_distribution(self.chain, len(self.age_shares))
 
     def to_json(self) -> dict[str, Any]:
         """Figures by name; null where nothing is known or nothing is finite."""
-        chain, expected = self.chain, self.expected_age_shares
+        expected, shares = self.expected, self.expected_age_shares
         return {
             "model": self.channel.model,
             "slots": self.outages.slots,
@@ -66,25 +100,34 @@ class ChannelStudy:
             "longest": self.outages.longest,
             "histogram": {str(length): count for length, count in self.outages.histogram.items()},
             "mean_age": self.outages.age.mean,
+            "late": self.late,
             "age_shares": self.age_shares.tolist(),
-            "closed_form": None if chain is None else {
-                "loss_rate": chain.loss_rate,
-                "mean_burst": chain.mean_burst,
-                "mean_age": chain.mean_age if math.isfinite(chain.mean_age) else None,
-                "age_shares": None if expected is None else expected.tolist(),
+            "closed_form": None if expected == Expected() else {
+                **expected._asdict(),
+                "age_shares": None if shares is None else shares.tolist(),
             },
         }  # fmt: skip
 
 
-def study(channel: ChannelParameters, seed: int, link: str, slots: int, ts: float) -> ChannelStudy:
+def study(
+    channel: ChannelParameters, seed: int, link: str, slots: int, ts: float, places: Floats | None = None
+) -> ChannelStudy:
     """The first `slots` slots of a channel: those that a run with this seed meets on this link.
 
-    Raises TraceError for a trace that cannot be used or must not be outrun.
+    `places` are those of the AGV in frame `map` [m], shape (slots, 2); without them it stands at the origin. Raises
+    TraceError for a trace that cannot be used or must not be outrun.
     """
-    lost = Air(seed, slots).verdicts(channel, link)
-    k = np.arange(slots)
-    age = ages(k, lost)
-    return ChannelStudy(channel, lost, age, link_outages(k, lost, age, ts), chain_of(channel))
+    air, k = Air(seed, slots, ts), np.arange(slots)
+    places = np.zeros((slots, 2)) if places is None else places
+    way = float(np.hypot(*np.diff(places, axis=0).T).sum())
+    if channel.is_direct:
+        lost = air.verdicts(channel, link)
+        age = ages(k, lost)
+        return ChannelStudy(channel, lost, age, link_outages(k, lost, age, ts), chain_of(channel), way=way)
+    marks, asked = blank(slots), air.way(channel, link)
+    compiled(listen)(asked, marks, numbers(places))
+    age, late = k - marks.held, float(np.mean(np.asarray(asked.waits)[~marks.lost] > 0))
+    return ChannelStudy(channel, marks.lost, age, link_outages(k, marks.lost, age, ts), chain_of(channel), late, way)
 
 
 def age_distribution(chain: Chain, count: int) -> Floats:

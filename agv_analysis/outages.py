@@ -88,14 +88,15 @@ class Outages:
 def outages(run: Run) -> Outages:
     """Outages of a run. Raises UserError if the run has no step.
 
-    The age of the uplink is the recorded n_ul, that of the downlink follows from its verdicts. Where steps are missing
-    from a recording an outage ends: nobody knows what became of those slots.
+    The ages are those that the slots say; that of the downlink follows from its verdicts where it is not recorded.
+    Where steps are missing from a recording an outage ends: nobody knows what became of those slots.
     """
     if not len(run):
         raise UserError(f"{run.source}: no step of the loop in it, so no outage: record at least one")
+    n_dl = ages(run.k, run.downlink_lost) if run.n_dl is None else run.n_dl
     return Outages(
         uplink=link_outages(run.k, run.lost, run.n_ul, run.ts),
-        downlink=link_outages(run.k, run.downlink_lost, ages(run.k, run.downlink_lost), run.ts),
+        downlink=link_outages(run.k, run.downlink_lost, n_dl, run.ts),
     )
 
 

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from agv_analysis.bag_writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.convergence import body_errors, wrapped
-from agv_analysis.run import Floats, Run
+from agv_analysis.run import Floats, LinkSlots, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S, Grid
-from agv_ros.wire import DELIVERED, SQUARED_LENGTH, yaw_of_quaternion
+from agv_ros.wire import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_quaternion
 
 Steps = NDArray[np.int64]
 
@@ -148,8 +148,11 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
             f"{len(bag[names['edge/slot']])} slots, of which {poses.off_grid} and {slots.off_grid} are not on the grid "
             f"of {scenario.plant.start_time:g} s + k * {scenario.plant.ts:g} s: are these the run's parameters?"
         )
-    n_ul, lost = _verdicts(slots, k, scenario.grid)
+    n_ul, lost, uplink = _verdicts(slots, k, scenario.grid)
     downlink = on_steps.get("agv/slot")
+    n_dl, downlink_lost, of_downlink = (
+        (None, np.zeros_like(lost), None) if downlink is None else _verdicts(downlink, k, scenario.grid)
+    )
     sent = _postures(poses, "pose", k, scenario.plant.initial_pose[2])
     true = on_steps.get("agv/ground_truth", _NOTHING)
     knows = bool(true.at(k)[1].all())
@@ -163,7 +166,10 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         command=_commands(on_steps["edge/cmd_vel"], k),
         n_ul=n_ul,
         lost=lost,
-        downlink_lost=np.zeros_like(lost) if downlink is None else _verdicts(downlink, k, scenario.grid)[1],
+        downlink_lost=downlink_lost,
+        n_dl=n_dl,
+        uplink=uplink,
+        downlink=of_downlink,
         source=source,
         unexplained=unexplained(on_steps, scenario.grid),
     )
@@ -173,8 +179,8 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
     )
 
 
-def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.bool_]]:
-    """Age n(k) in steps of what is held behind a channel, and whether slot k was lost; shapes (N,).
+def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.bool_], LinkSlots]:
+    """Age n(k) in steps of what is held behind a channel, whether slot k was lost, and why; shapes (N,).
 
     Where there is no slot, or nothing has been received yet, the age is the number of steps since step 0.
     """
@@ -182,7 +188,28 @@ def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.b
     held_ns = np.where(there, _stamps(slots.messages, "time_ref")[index], 0)
     age = np.where(held_ns > 0, k - (held_ns - grid.start_ns) // grid.ts_ns, k)
     source = slots.messages["source"][index]
-    return age, there & (source != DELIVERED.encode())
+    lost = there & (source != DELIVERED.encode()) & (source != DELAYED.encode())
+    return age, lost, _reasons(np.where(there, slots.messages["header.frame_id"][index], b""))
+
+
+def _reasons(notes: NDArray[np.bytes_]) -> LinkSlots:
+    """What the notes of slots say, shape (N,). Those of older recordings are empty."""
+    said, of = np.unique(notes, return_inverse=True)
+    facts = [facts_in(note.decode("utf-8", "replace")) for note in said.tolist()]
+    return LinkSlots(
+        cause=np.array([fact.get("cause", "") for fact in facts], dtype=np.str_)[of],
+        state=np.array([_number(fact, "state", 0.0) for fact in facts], dtype=np.int64)[of],
+        gain=np.array([_number(fact, "gain", math.nan) for fact in facts])[of],
+        delay=np.array([_number(fact, "delay", 0.0) for fact in facts], dtype=np.int64)[of],
+    )
+
+
+def _number(fact: Mapping[str, str], name: str, absent: float) -> float:
+    """A number of a note; `absent` if it is not there, or none."""
+    try:
+        return float(fact.get(name, absent))
+    except ValueError:
+        return absent
 
 
 def _yaws(messages: OnSteps, pose: str, k: Steps) -> Floats:
@@ -216,15 +243,15 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
     """Messages by topic that should be in the recording, since no channel lost them, and are not.
 
     Each message of a step follows from the one before it in the loop: a slot from the pose, the forwarded pose from a
-    slot that says `delivered`, the error from a slot behind which a pose is held, and so on. The last step may have
-    been under way when the recording ended, and does not count.
+    slot that says `delivered`, or `delayed` and until when, the error from a slot behind which a pose is held, and so
+    on. The last step may have been under way when the recording ended, and does not count.
     """
     poses = on_steps["agv/pose"].k
     first = max((messages.k[0] for messages in on_steps.values() if len(messages.k)), default=0) if poses[0] else 0
     expected = {
         "agv/pose": np.arange(first, poses[-1] + 1),
         "edge/slot": poses,
-        "edge/pose": _where(on_steps["edge/slot"], lambda slots: slots["source"] == DELIVERED.encode()),
+        "edge/pose": _passed_on(on_steps["edge/slot"], poses[-1]),
         "edge/error": _where(on_steps["edge/slot"], lambda slots: _stamps(slots, "time_ref") >= grid.start_ns),
         "edge/cmd_vel": on_steps["edge/error"].k,
     }
@@ -232,13 +259,20 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
         expected["agv/ground_truth"] = poses
     if "agv/slot" in on_steps:
         expected["agv/slot"] = on_steps["edge/cmd_vel"].k
-        expected["agv/cmd_vel"] = _where(on_steps["agv/slot"], lambda slots: slots["source"] == DELIVERED.encode())
+        expected["agv/cmd_vel"] = _passed_on(on_steps["agv/slot"], poses[-1])
     missing = {
         topic: int(np.count_nonzero(~on_steps[topic].at(k[(k >= first) & (k < poses[-1])])[1]))
         for topic, k in expected.items()
         if topic in on_steps
     }
     return {topic: count for topic, count in missing.items() if count}
+
+
+def _passed_on(slots: OnSteps, last: int) -> Steps:
+    """Steps whose messages a link has passed on before step `last`."""
+    source, delay = slots.messages["source"], _reasons(slots.messages["header.frame_id"]).delay
+    came = (source == DELIVERED.encode()) | ((source == DELAYED.encode()) & (slots.k + delay < last))
+    return np.asarray(slots.k[came])
 
 
 def _where(messages: OnSteps, condition: Callable[[NDArray[np.void]], NDArray[np.bool_]]) -> Steps:

@@ -14,6 +14,20 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class LinkSlots:
+    """Why one direction of the radio did what it did to the messages of N slots."""
+
+    cause: NDArray[np.str_]
+    """Of a loss: the channel's model, or `outage` if its schedule says so; empty where nothing is lost; shape (N,)."""
+    state: NDArray[np.int64]
+    """State of a channel with memory that decided, shape (N,)."""
+    gain: Floats
+    """The channel's gain [dB] over its mean, shape (N,); NaN where it has none."""
+    delay: NDArray[np.int64]
+    """Slots that the message is under way, 0 if it comes in its own slot or not at all, shape (N,)."""
+
+
+@dataclass(frozen=True)
 class Run:
     """A run of N steps, row i of every array belonging to step k[i]; SI units, frame `map` unless said otherwise."""
 
@@ -34,6 +48,11 @@ class Run:
     """Verdict of the uplink on slot k, shape (N,)."""
     downlink_lost: NDArray[np.bool_]
     """Verdict of the downlink on slot k, shape (N,)."""
+    n_dl: NDArray[np.int64] | None = None
+    """Steps since the freshest command that the AGV holds was sent, shape (N,); None if nobody has written it down."""
+    uplink: LinkSlots | None = None
+    """What is known of the uplink's slots beside their verdicts; None if nothing is."""
+    downlink: LinkSlots | None = None
     source: str = "simulation"
     """Where the run comes from: the path of its bag, or `simulation`."""
     unexplained: Mapping[str, int] = field(default_factory=dict)

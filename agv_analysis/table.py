@@ -63,8 +63,12 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
         "Age of information",
         (f"n_ul: mean {up.age.mean:.2f}, p99 {up.age.p99}, at most {up.age.max} steps ({up.age.max * ms:g} ms)"),
     )
-    if analysis.outages.downlink.lost:
-        yield "Downlink", f"{analysis.outages.downlink.loss_rate:.2%} lost"
+    down = analysis.outages.downlink
+    if down.lost or down.age.max:
+        yield (
+            "Downlink",
+            f"{down.loss_rate:.2%} lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
+        )
     found = analysis.convergence
     yield "Settling", f"{_steps(found.settle_1cm_steps, ms)} to 1 cm, {_steps(found.settle_2pct_steps, ms)} to 2 %"
     yield "Overshoot", "no initial error" if found.overshoot is None else f"{found.overshoot:.2%}"
@@ -93,7 +97,13 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
         motion = "" if analysis.contraction is None else f", {analysis.contraction:.6g} about the motion"
         told = f"times {analysis.floquet:.6g} a step about the reference{motion}"
         yield "These very losses", _verdict(analysis.floquet < 1.0, told)
-    colour = {"asymptotic": "green", "mean-square": "green", "bounded": "yellow", "unstable": "red"}
+    colour = {
+        "asymptotic": "green",
+        "mean-square": "green",
+        "bounded": "yellow",
+        "unstable": "red",
+        "unknown": "yellow",
+    }
     verdict = analysis.verdict
     yield "Verdict", f"[bold {colour[verdict.word]}]{verdict.word}[/] (by {verdict.criterion})"
     yield "Margin", verdict.margin

@@ -9,7 +9,8 @@ class HeldCommand:
     """Zero-order hold with a limit on age.
 
     `outdated` counts commands that are not obeyed for their stamp: they came after a newer one, or are from the future
-    and would be obeyed until it is past. `stops` counts how often the AGV was stopped for want of a command.
+    and would be obeyed until it is past; and those that came a second time. `stops` counts how often the AGV was
+    stopped for want of a command.
     """
 
     def __init__(self, timeout_ns: int) -> None:
@@ -23,7 +24,8 @@ class HeldCommand:
     def offer(self, command: Command) -> None:
         """Take a command; one that is older than the newest, or newer than the last instant, is not obeyed."""
         is_early = self._now_ns is not None and command.stamp_ns > self._now_ns
-        if is_early or (self._newest is not None and command.stamp_ns < self._newest.stamp_ns):
+        is_late = self._newest is not None and command.stamp_ns < self._newest.stamp_ns
+        if is_early or is_late or command == self._newest:
             self.outdated += 1
             return
         self._newest = command

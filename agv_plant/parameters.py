@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
+from agv_plant.channels.coverage_hole import NO_HOLES
+from agv_plant.channels.coverage_hole import rows_of as holes
 from agv_plant.channels.installed import TRACE, known_models
+from agv_plant.channels.placed import EVERYWHERE, kind_of
+from agv_plant.channels.schedule import Entry, parse_schedule
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.unicycle import STEPS
-from agv_ros.parameters import LoopParameters, ParameterError, group, parameter
+from agv_ros.parameters import LoopParameters, ParameterError, group, parameter, parameters_of
 
 
 @dataclass(frozen=True)
@@ -88,9 +93,13 @@ class ChannelParameters:
 
     model: str = parameter("perfect", "channel model", choices=known_models())
     p: float = parameter(
-        0.0, "bernoulli: loss probability; gilbert_elliott: probability of good to bad, per slot", low=0.0, high=1.0,
+        0.0,
+        "bernoulli: loss probability; coverage_hole: the same outside of the holes; gilbert_elliott: probability of "
+        "good to bad, per slot",
+        low=0.0,
+        high=1.0,
         runtime=True,
-    )  # fmt: skip
+    )
     r: float = parameter(1.0, "gilbert_elliott: probability of bad to good, per slot", low=0.0, high=1.0, runtime=True)
     h: float = parameter(
         0.0, "gilbert_elliott: probability of delivery in the bad state", low=0.0, high=1.0, runtime=True
@@ -103,6 +112,24 @@ class ChannelParameters:
         -1, "burst: the one step from which n slots are lost; -1: n are lost after each received one", low=-1,
         high=2**62, runtime=True,
     )  # fmt: skip
+    hole_loss: float = parameter(
+        1.0, "coverage_hole: loss probability inside of a hole", low=0.0, high=1.0, runtime=True
+    )
+    hole_circles: tuple[float, ...] = parameter(
+        NO_HOLES, "coverage_hole: x, y, radius of each round hole, in frame map; [0.0]: none", unit="m", any_length=True
+    )
+    hole_polygons: tuple[float, ...] = parameter(
+        NO_HOLES,
+        "coverage_hole: x, y of the corners of each other hole, in frame map, its first corner again at its end; "
+        "[0.0]: none",
+        unit="m",
+        any_length=True,
+    )
+    carrier: float = parameter(3.7e9, "rayleigh: carrier frequency", unit="Hz", low=1e6, high=1e12)
+    margin: float = parameter(
+        20.0, "rayleigh: fade margin; lost where the gain is more than this below its mean", unit="dB", low=-100.0,
+        high=300.0, runtime=True,
+    )  # fmt: skip
     trace_file: str = parameter(
         "",
         "trace: CSV file with a row a slot, column lost (0, 1) or verdict (delivered, lost); or JSON, a list so called",
@@ -113,7 +140,27 @@ class ChannelParameters:
         choices=ENDS,
     )
     correlation: float = parameter(
-        0.0, "downlink: share of slots in which it draws the uplink's random numbers; 1: one fate", low=0.0, high=1.0
+        0.0,
+        "downlink: share of slots in which it draws the uplink's random numbers; rayleigh: correlation of the two "
+        "links' complex gains; 1: one fate",
+        low=0.0,
+        high=1.0,
+    )
+    delay: float = parameter(
+        0.0, "time under way of a message that is not lost, rounded up to whole slots", unit="s", low=0.0, high=60.0,
+        runtime=True,
+    )  # fmt: skip
+    jitter: float = parameter(
+        0.0, "the delay is uniform in delay +- jitter; beyond ts, messages overtake each other", unit="s", low=0.0,
+        high=60.0, runtime=True,
+    )  # fmt: skip
+    duplicate: float = parameter(
+        0.0, "probability that a message comes a second time, with a delay of its own", low=0.0, high=1.0, runtime=True
+    )
+    schedule: str = parameter(
+        "",
+        "what changes in a run, as in '20: p=0.1; 20: outage=0.3 every 5; 60: outage=0': from 20 s on p is 0.1 and all "
+        "is lost for 0.3 s every 5 s, from 60 s on no more; takes any parameter that changes at run time",
     )
     arguments: tuple[float, ...] = parameter(
         (0.0,), "a model of another package: whatever numbers it takes", any_length=True, runtime=True
@@ -123,6 +170,31 @@ class ChannelParameters:
         """Check what no single bound can say."""
         if self.model == TRACE and not self.trace_file:
             raise ParameterError("a channel's model is trace, but its trace_file is empty: name a file")
+        if not holes(self.hole_circles, self.hole_polygons) and self.model == "coverage_hole":
+            raise ParameterError(
+                "a channel's model is coverage_hole, but neither hole_circles nor hole_polygons has one"
+            )
+        _ = self.entries
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """The schedule, by time."""
+        return _entries(self.schedule)
+
+    @property
+    def is_direct(self) -> bool:
+        """Is what is lost known without the AGV, and all else there in its own slot?"""
+        return not (self.is_placed or self.delays)
+
+    @property
+    def is_placed(self) -> bool:
+        """Does what is lost depend on where the AGV is?"""
+        return kind_of(self.model) != EVERYWHERE
+
+    @property
+    def delays(self) -> bool:
+        """May a message arrive later than in its slot?"""
+        return self.delay + self.jitter > 0.0 or any(entry.name in ("delay", "jitter") for entry in self.entries)
 
 
 @dataclass(frozen=True)
@@ -132,3 +204,16 @@ class RelayParameters(LoopParameters):
     uplink: ChannelParameters = group(ChannelParameters)
     downlink: ChannelParameters = group(ChannelParameters)
     seed: int = parameter(1, "seed of all random outcomes of the channel", low=0, high=2**62)
+
+
+_CHANGEABLE = {
+    name: found
+    for name, found in parameters_of(ChannelParameters).items()
+    if found.runtime and found.kind != "double_array"
+}
+"""What a schedule may change."""
+
+
+@functools.lru_cache(maxsize=256)
+def _entries(schedule: str) -> tuple[Entry, ...]:
+    return parse_schedule(schedule, _CHANGEABLE) if schedule else ()

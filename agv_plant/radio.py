@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import bisect
+import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_plant.channels import GOOD
+from agv_plant.channels.delay import delays_of, whole_slots
 from agv_plant.channels.installed import TRACE, ChannelError, find_model
+from agv_plant.channels.placed import NOWHERE, UPLINK, floor_of, kind_of, levels_of, verdict_at
+from agv_plant.channels.schedule import OUTAGE, Segment, is_scripted, segments_of
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import uniforms
+from agv_ros.parameters import LoopParameters
 from agv_ros.stamps import Grid, Steps
-from agv_ros.wire import DELIVERED, LOST, Slot
+from agv_ros.wire import DELAYED, DELIVERED, LOST, Slot
 
 _BLOCK = 4096
-
-UPLINK = "uplink"
-"""The stream from which a correlated channel takes its random numbers."""
 
 
 def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
@@ -35,8 +39,40 @@ def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, cou
     return np.where(shared, uniforms(seed, UPLINK, first, count), own)
 
 
+def delay_draws(seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
+    """The same for delays, those of a link alone."""
+    return uniforms(seed, f"{stream}/delay", first, count)
+
+
+class Verdict(NamedTuple):
+    """What the channel does to the message of a slot, and why."""
+
+    lost: bool
+    cause: str = ""
+    """The channel's model, or `outage` if the schedule says so; empty if the message is not lost."""
+    state: int = GOOD
+    """The state that decided, of a channel with memory."""
+    gain: float = math.nan
+    """Of the channel [dB], NaN if it has none."""
+
+
+class _Drawn:
+    """Random numbers of single slots, made in blocks."""
+
+    def __init__(self, make: Callable[[int, int], NDArray[np.float64]]) -> None:
+        self._make = make
+        self._first = -1
+        self._block: Sequence[Sequence[float]] = ()
+
+    def at(self, k: int) -> Sequence[float]:
+        first = k - k % _BLOCK
+        if first != self._first:
+            self._block, self._first = self._make(first, _BLOCK).tolist(), first
+        return self._block[k - first]
+
+
 class Channel:
-    """Verdicts of one channel, a pure function of (parameters, seed, stream name, k).
+    """Verdicts of one channel, a pure function of (parameters, seed, stream name, k) and, for some, of the place.
 
     The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot
     0, so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
@@ -44,31 +80,77 @@ class Channel:
     another package that cannot be loaded.
     """
 
-    def __init__(self, parameters: ChannelParameters, seed: int, stream: str) -> None:
+    def __init__(self, parameters: ChannelParameters, seed: int, stream: str, ts: float = LoopParameters.ts) -> None:
+        self._ts = ts
         self.parameters = parameters
-        self._seed = seed
-        self._stream = stream
         measured = parameters.model == TRACE
+        self._kind = kind_of(parameters.model)
+        self._floor = floor_of(parameters, seed, stream) if parameters.is_placed else []
         self._trace = load_trace(parameters.trace_file) if measured else ()
-        self._model = None if measured else find_model(parameters.model)
+        self._model = None if measured or parameters.is_placed else find_model(parameters.model)
+        self._random = _Drawn(lambda first, count: draws(self.parameters, seed, stream, first, count))
+        self._random_delays = _Drawn(lambda first, count: delay_draws(seed, stream, first, count))
         self._next = 0
         self._state = GOOD
-        self._last = False
-        self._first_of_block = -1
-        self._block: Sequence[Sequence[float]] = ()
+        self._last = Verdict(False)
 
-    def lost(self, k: int) -> bool:
-        """Is the message of slot `k` lost? Slot 0 never is: a run begins with the AGV known to the edge."""
+    @property
+    def parameters(self) -> ChannelParameters:
+        """Those that its schedule starts from."""
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, parameters: ChannelParameters) -> None:
+        self._parameters = parameters
+        self._segments = segments_of(parameters, self._ts)
+        self._firsts = [segment.first for segment in self._segments]
+
+    def lost(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> bool:
+        """Is the message of slot `k` lost, sent when the AGV is at (x, y) [m]?"""
+        return self.judge(k, x, y).lost
+
+    def judge(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> Verdict:
+        """The verdict on the message of slot `k`. Slot 0 is never lost: a run begins with the AGV known to the edge."""
+        verdict = self._by_place(k, x, y) if self._kind else self._by_slot(k)
+        if verdict.lost and k == 0:
+            return verdict._replace(lost=False, cause="")
+        if k > 0 and is_scripted(k, *self._segment(k).outage, self._ts):
+            return verdict._replace(lost=True, cause=OUTAGE)
+        return verdict
+
+    def delays(self, k: int) -> tuple[float, float]:
+        """Slots that the message of slot `k` is under way if it is not lost, and its copy, -1 if there is none."""
+        c = self._segment(k).channel
+        if c.delay + c.jitter + c.duplicate == 0.0:
+            return 0.0, -1.0
+        u_delay, u_twice, u_copy, _ = self._random_delays.at(k)
+        return delays_of(k, u_delay, u_twice, u_copy, c.delay, c.jitter, c.duplicate, self._ts)
+
+    def _segment(self, k: int) -> Segment:
+        if len(self._segments) == 1:
+            return self._segments[0]
+        return self._segments[bisect.bisect_right(self._firsts, k) - 1]
+
+    def _by_place(self, k: int, x: float, y: float) -> Verdict:
+        levels, u = levels_of(self._segment(k).channel), self._random.at(k)[0]
+        lost, gain = verdict_at(self._kind, self._floor, *levels, u, x, y)
+        return Verdict(lost, self.parameters.model if lost else "", GOOD, gain)
+
+    def _by_slot(self, k: int) -> Verdict:
         if self._model is None:
-            return k > 0 and self._measured(k)
+            lost = self._measured(k)
+            return Verdict(lost, TRACE if lost else "")
         if k < self._next - 1:
             self._next, self._state = 0, GOOD
         while self._next <= k:
+            before = self._state
             try:
-                lost, self._state = self._model(self.parameters, self._next, self._uniforms(self._next), self._state)
+                lost, self._state = self._model(
+                    self._segment(self._next).channel, self._next, self._random.at(self._next), before
+                )
             except Exception as error:  # another package's model, in which anything can go wrong
                 raise ChannelError(f"channel model {self.parameters.model}, slot {self._next}: {error}") from error
-            self._last = lost and self._next > 0
+            self._last = Verdict(bool(lost), self.parameters.model if lost else "", before)
             self._next += 1
         return self._last
 
@@ -78,13 +160,6 @@ class Channel:
         except TraceError as error:
             raise TraceError(f"{self.parameters.trace_file}: {error}") from None
 
-    def _uniforms(self, k: int) -> Sequence[float]:
-        first = k - k % _BLOCK
-        if first != self._first_of_block:
-            self._block = draws(self.parameters, self._seed, self._stream, first, _BLOCK).tolist()
-            self._first_of_block = first
-        return self._block[k - first]
-
 
 def check_length(parameters: ChannelParameters, steps: float) -> None:
     """Is a trace that may not be outrun long enough for a run of `steps`? Raises TraceError before the run if not."""
@@ -92,36 +167,84 @@ def check_length(parameters: ChannelParameters, steps: float) -> None:
         Channel(parameters, 0, "").lost(max(0, round(steps) - 1))
 
 
-def losses(parameters: ChannelParameters, seed: int, stream: str, steps: int) -> NDArray[np.bool_]:
-    """Verdicts of the slots 0 .. steps - 1, True where lost, shape (steps,)."""
-    channel = Channel(parameters, seed, stream)
+def losses(
+    parameters: ChannelParameters, seed: int, stream: str, steps: int, ts: float = LoopParameters.ts
+) -> NDArray[np.bool_]:
+    """Verdicts of the slots 0 .. steps - 1 of an AGV that is nowhere, True where lost, shape (steps,)."""
+    channel = Channel(parameters, seed, stream, ts)
     return np.fromiter((channel.lost(k) for k in range(steps)), dtype=np.bool_, count=steps)
 
 
+class Passage(NamedTuple):
+    """What a slot of the link brings: the verdict on its message, and the messages that arrive in it, in order."""
+
+    slot: Slot
+    arrived: list[bytes]
+
+
 class Link:
-    """A channel, the memory of the receiver behind it, and a count of what became of the messages."""
+    """A channel with the messages under way in it, the memory of the receiver behind it, and a count of what happened.
+
+    Theory of operation. A slot is taken by the message of its step. What is not lost joins those under way, once or
+    twice, with its instant of arrival; then all arrive that are due, in the order of these instants. So the slot says
+    what the receiver holds after them, and both are functions of the stamps alone.
+    """
 
     def __init__(self, channel: Channel, grid: Grid) -> None:
         self.channel = channel
         self._steps = Steps(grid)
         self._freshest_ns = 0
+        self._under_way: list[tuple[int, float, int, int, bytes]] = []
+        self._order = 0
         self.sent = 0
         self.lost = 0
         self.longest = 0
         """Most messages lost in a row."""
+        self.delayed = 0
+        """Messages that came, or will come, in a later slot than their own."""
+        self.copies = 0
+        """Messages that came, or will come, a second time."""
         self._run = 0
 
-    def transmit(self, stamp_ns: int) -> Slot:
-        """The slot of the message with this stamp. Raises OffGridError if the stamp is no sampling instant."""
+    def transmit(self, stamp_ns: int, message: bytes = b"", place: tuple[float, float] = NOWHERE) -> Passage:
+        """The slot of the message with this stamp, sent when the AGV is at `place` [m].
+
+        Raises OffGridError if the stamp is no sampling instant.
+        """
         k = self._steps.of(stamp_ns)
-        lost = self.channel.lost(k)
+        if k == 0:  # begins a run: whatever is held or under way of a run before it is past
+            self._freshest_ns, self._under_way = 0, []
+        verdict = self.channel.judge(k, *place)
+        wait = 0 if verdict.lost else self._send(k, stamp_ns, message)
+        self._count(verdict, wait)
+        arrived = []
+        while self._under_way and self._under_way[0][0] <= k:
+            *_, sent_ns, data = heapq.heappop(self._under_way)
+            arrived.append(data)
+            self._freshest_ns = max(self._freshest_ns, sent_ns)
+        said = LOST if verdict.lost else DELAYED if wait else DELIVERED
+        return Passage(Slot(stamp_ns, self._freshest_ns, said, self._note(verdict, wait)), arrived)
+
+    def _send(self, k: int, stamp_ns: int, message: bytes) -> int:
+        """Put a message, and its copy if there is one, under way; returns the slots until the first of them arrives."""
+        delays = [delay for delay in self.channel.delays(k) if delay >= 0.0]
+        for delay in delays:
+            arrival = k + whole_slots(delay), k + delay
+            heapq.heappush(self._under_way, (*arrival, self._order, stamp_ns, message))
+            self._order += 1
+        self.copies += len(delays) - 1
+        return whole_slots(min(delays))
+
+    def _count(self, verdict: Verdict, wait: int) -> None:
         self.sent += 1
-        if lost:
-            self.lost += 1
-            self._run += 1
-            self.longest = max(self.longest, self._run)
-        else:
-            self._run = 0
-            # Step 0 begins a run: whatever is held of a run before it is not fresher.
-            self._freshest_ns = stamp_ns if k == 0 else max(self._freshest_ns, stamp_ns)
-        return Slot(stamp_ns, self._freshest_ns, LOST if lost else DELIVERED)
+        self.lost += verdict.lost
+        self.delayed += wait > 0
+        self._run = self._run + 1 if verdict.lost else 0
+        self.longest = max(self.longest, self._run)
+
+    def _note(self, verdict: Verdict, wait: int) -> str:
+        facts = [f"cause={verdict.cause}", f"run={self._run}"] if verdict.lost else []
+        facts += [f"delay={wait}"] if wait else []
+        facts += [f"state={verdict.state}"] if verdict.state != GOOD else []
+        facts += [] if math.isnan(verdict.gain) else [f"gain={verdict.gain:.2f}"]
+        return " ".join(facts)

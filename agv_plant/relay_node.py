@@ -8,21 +8,26 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from sensor_msgs.msg import TimeReference
 
+from agv_plant.channels.placed import NOWHERE
 from agv_plant.parameters import RelayParameters
-from agv_plant.radio import Channel, Link
+from agv_plant.radio import Channel, Link, Passage
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode, Output
-from agv_ros.wire import DELIVERED, Slot, encode_slot, stamp_of
+from agv_ros.wire import InvalidMessageError, decode_pose, encode_slot, stamp_of
 
 
 class RelayNode(LoopNode[RelayParameters]):
-    """Forwards or loses each message as it is, and says which in the slot."""
+    """Forwards, delays or loses each message as it is, and says which in the slot."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("relay", RelayParameters, **node_options)
         settings = self.settings
-        self.uplink = Link(Channel(settings.uplink, settings.seed, "uplink"), self.grid)
-        self.downlink = Link(Channel(settings.downlink, settings.seed, "downlink"), self.grid)
+        self.uplink, self.downlink = (
+            Link(Channel(channel, settings.seed, name, settings.ts), self.grid)
+            for name, channel in (("uplink", settings.uplink), ("downlink", settings.downlink))
+        )
+        self._needs_place = settings.uplink.is_placed or settings.downlink.is_placed
+        self._place = NOWHERE
         self._edge_pose = self.output(PoseStamped, "edge/pose")
         self._edge_slot = self.output(TimeReference, "edge/slot")
         self._agv_cmd_vel = self.output(TwistStamped, "agv/cmd_vel")
@@ -31,12 +36,15 @@ class RelayNode(LoopNode[RelayParameters]):
         self.input(TwistStamped, "edge/cmd_vel", self._on_command, self._agv_cmd_vel, self._agv_slot)
 
     def _on_pose(self, data: bytes) -> None:
-        slot = self.uplink.transmit(stamp_of(data))
-        self.report_every_second(slot.stamp_ns)
-        _pass_on(data, slot, self._edge_pose, self._edge_slot)
+        if self._needs_place:
+            self._place = _place_in(data, self._place)
+        passage = self.uplink.transmit(stamp_of(data), data, self._place)
+        self.report_every_second(passage.slot.stamp_ns)
+        _pass_on(passage, self._edge_pose, self._edge_slot)
 
     def _on_command(self, data: bytes) -> None:
-        _pass_on(data, self.downlink.transmit(stamp_of(data)), self._agv_cmd_vel, self._agv_slot)
+        passage = self.downlink.transmit(stamp_of(data), data, self._place)
+        _pass_on(passage, self._agv_cmd_vel, self._agv_slot)
 
     def facts(self) -> dict[str, str]:
         """What each link did to its messages so far."""
@@ -55,13 +63,23 @@ def _counts(name: str, link: Link) -> dict[str, str]:
         f"{name} lost": str(link.lost),
         f"{name} loss rate": f"{rate:.6f}",
         f"{name} longest outage": str(link.longest),
+        f"{name} delayed": str(link.delayed),
+        f"{name} duplicated": str(link.copies),
     }
 
 
-def _pass_on(data: bytes, slot: Slot, forward: Output, verdict: Output) -> None:
-    if slot.verdict == DELIVERED:
+def _place_in(pose: bytes, last: tuple[float, float]) -> tuple[float, float]:
+    """Where a pose says that the AGV is [m]; `last` if it cannot be read, which is for its receiver to complain of."""
+    try:
+        return decode_pose(pose)[1:3]
+    except InvalidMessageError:
+        return last
+
+
+def _pass_on(passage: Passage, forward: Output, verdict: Output) -> None:
+    for data in passage.arrived:
         forward.publish(data)
-    verdict.publish(encode_slot(slot))
+    verdict.publish(encode_slot(passage.slot))
 
 
 def main(args: Sequence[str] | None = None) -> None:

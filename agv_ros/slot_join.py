@@ -47,7 +47,8 @@ MOST_WAITING = 1000
 class SlotJoin(Generic[M]):
     """Holds messages and slots until they fit together.
 
-    `outdated` counts slots and messages that came too late to matter, `unanswered` slots whose message never came.
+    `outdated` counts slots and messages that came too late to matter, or a second time, and were put aside;
+    `unanswered` counts slots whose message never came.
     """
 
     def __init__(self, start_ns: int) -> None:
@@ -66,11 +67,15 @@ class SlotJoin(Generic[M]):
         if message.stamp_ns == self._start_ns:
             self._arrived.clear()
             self._is_ahead = all(slot.stamp_ns != self._start_ns for slot in self._waiting)
-        elif message.stamp_ns < self._settled_ns and not self._is_ahead:
+        elif not self._is_ahead and self._is_known(message.stamp_ns):
             self.outdated += 1
             return []
         self._arrived[message.stamp_ns] = message
         return self._complete()
+
+    def _is_known(self, stamp_ns: int) -> bool:
+        """Has this message been here, or a fresher one been used?"""
+        return stamp_ns <= self._settled_ns or self._arrived.get(stamp_ns) is not None
 
     def reject(self, stamp_ns: int) -> list[Joined[M]]:
         """The message with this stamp came but cannot be used: its slot goes on with the message held before."""
@@ -123,6 +128,8 @@ class SlotJoin(Generic[M]):
         if message is not None:
             self._held = message
         self._settled_ns = slot.freshest_ns
-        self._arrived = {ns: later for ns, later in self._arrived.items() if ns > slot.freshest_ns}
+        later = {ns: message for ns, message in self._arrived.items() if ns > slot.freshest_ns}
+        self.outdated += len(self._arrived) - len(later)  # overtaken, before anybody asked for them
+        self._arrived = later
         self._last_slot_ns = slot.stamp_ns
         return Joined(slot, self._held)

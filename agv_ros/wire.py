@@ -34,6 +34,8 @@ FRAME_REFERENCE = "reference"
 
 DELIVERED = "delivered"
 LOST = "lost"
+DELAYED = "delayed"
+"""What a slot says of its message; a delayed one comes in a later slot."""
 
 SQUARED_LENGTH = 0.01
 """How far the squared length of a rotation's quaternion may be from one."""
@@ -80,6 +82,13 @@ class Slot(NamedTuple):
     stamp_ns: int
     freshest_ns: int
     verdict: str
+    note: str = ""
+    """More of the verdict, as in `cause=rayleigh run=3 gain=-23.81`: words `name=value` with a blank between them."""
+
+
+def facts_in(note: str) -> dict[str, str]:
+    """What a slot's note says, by name; words of another form are passed over."""
+    return dict(word.split("=", 1) for word in note.split() if "=" in word)
 
 
 def quaternion_of_yaw(theta: float) -> tuple[float, float]:
@@ -92,7 +101,7 @@ def yaw_of_quaternion(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=512)
 def _layout(order: str, before: str, strings: tuple[int, ...], after: str, alignment: int) -> struct.Struct:
     """Struct of `before`, then strings of these lengths (length word and text each), then `after` aligned."""
     fields = before
@@ -250,11 +259,14 @@ def decode_odometry(data: bytes) -> Pose:
 
 
 def encode_slot(slot: Slot) -> bytes:
-    """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = verdict."""
-    source = slot.verdict.encode() + b"\0"
-    layout = _layout("<", "iI", (1,), f"iII{len(source)}s", 4)
+    """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = verdict.
+
+    The note goes into header.frame_id, which this type has no other use for.
+    """
+    source, note = slot.verdict.encode() + b"\0", slot.note.encode() + b"\0"
+    layout = _layout("<", "iI", (len(note),), f"iII{len(source)}s", 4)
     return padded(
-        _LITTLE + layout.pack(*_split(slot.stamp_ns), 1, b"\0", *_split(slot.freshest_ns), len(source), source)
+        _LITTLE + layout.pack(*_split(slot.stamp_ns), len(note), note, *_split(slot.freshest_ns), len(source), source)
     )
 
 
@@ -264,9 +276,13 @@ def decode_slot(data: bytes) -> Slot:
     frame = _string_length(order, data, 8)
     source = _string_length(order, data, (12 + frame + 3) // 4 * 4 + 8)
     values = _unpack(_layout(order, "iI", (frame,), f"iII{source}s", 4), data)
-    text = bytes(values[-1])  # type: ignore[call-overload]
     freshest = int(values[4]) * NS_PER_S + int(values[5])
-    return Slot(int(values[0]) * NS_PER_S + int(values[1]), freshest, text.rstrip(b"\0").decode("utf-8", "replace"))
+    return Slot(int(values[0]) * NS_PER_S + int(values[1]), freshest, _text(values[-1]), _text(values[3]))
+
+
+def _text(value: object) -> str:
+    assert isinstance(value, bytes)
+    return value.rstrip(b"\0").decode("utf-8", "replace")
 
 
 def _aligned_string(text: str) -> bytes:

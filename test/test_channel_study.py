@@ -57,6 +57,33 @@ def test_the_slots_of_a_channel_follow_its_closed_form(channel: ChannelParameter
     assert (found.lost == losses(channel, 5, "uplink", 200_000)).all()
 
 
+def test_fading_s_closed_form_knows_the_speed() -> None:
+    """Along the y axis, fades of 6 dB: theory's loss rate and mean outage, which is half as long at twice the speed."""
+    channel = ChannelParameters(model="rayleigh", margin=6.0, carrier=9e8)
+    slow, fast = (
+        study(channel, 4, "uplink", 200_000, 0.001, np.outer(np.arange(200_000) * speed, (0.0, 0.001)))
+        for speed in (2.0, 4.0)
+    )
+    rho = 10.0 ** (-6.0 / 20.0)
+    lasts = 299_792_458.0 / 9e8 * math.expm1(rho**2) / (rho * math.sqrt(2.0 * math.pi)) / 0.002
+    assert slow.expected.mean_burst == pytest.approx(lasts, rel=1e-5)
+    assert fast.expected.mean_burst == pytest.approx(lasts / 2.0, rel=1e-5)
+    for found in (slow, fast):
+        assert found.expected.loss_rate == pytest.approx(-math.expm1(-(rho**2)))
+        # One field along 400 m, 1200 wavelengths: some hundred fades, each of a length of its own.
+        assert found.outages.loss_rate == pytest.approx(found.expected.loss_rate, rel=0.15)
+        assert found.outages.mean_burst == pytest.approx(found.expected.mean_burst, rel=0.15)
+
+
+def test_a_late_channel_has_its_losses_and_no_closed_form_of_its_ages() -> None:
+    found = study(ChannelParameters(model="bernoulli", p=0.2, delay=0.015), 1, "uplink", 50_000, 0.005)
+    assert found.expected.loss_rate == pytest.approx(0.2)
+    assert (found.expected.mean_age, found.expected_age_shares) == (None, None)
+    assert found.late == pytest.approx(1.0, abs=1e-4)  # all but that of slot 0
+    # The age is that without the delay, and three slots.
+    assert found.outages.age.mean == pytest.approx(0.2 / 0.8 + 3.0, abs=0.05)
+
+
 def test_a_channel_with_parameters_has_them_fitted() -> None:
     channel = ChannelParameters(model="gilbert_elliott", p=0.05, r=0.2)
     found = fitted(losses(channel, 1, "uplink", 200_000), ChannelParameters())
@@ -138,6 +165,25 @@ def test_channel_prints_writes_and_draws(agv_ncs: AgvNcs, tmp_path: Path) -> Non
     assert sum(figures["age_shares"]) == pytest.approx(1.0)
     assert len(files["csv"].read_text().splitlines()) == 1 + len(figures["age_shares"])
     assert files["png"].read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("settings_of", "said"),
+    [
+        (["model=rayleigh", "margin=3.0"], "rayleigh, carrier 3700000000.0, margin 3.0"),
+        (
+            ["model=coverage_hole", "hole_circles=[0, 10, 3]"],
+            "coverage_hole, p 0.02, hole_loss 1.0, hole_circles (0.0,",
+        ),
+        (["delay=0.02"], "k 1.0, delay 0.02"),
+        (["schedule=1: outage=0.2"], "k 1.0, schedule 1: outage=0.2"),
+    ],
+)
+def test_channel_says_what_comes_on_top_and_where(agv_ncs: AgvNcs, settings_of: list[str], said: str) -> None:
+    chosen = [word for setting in settings_of for word in ("--set", f"relay.uplink.{setting}")]
+    code, found = agv_ncs("channel", "config/outages.yaml", "--slots", "4000", *chosen)
+    assert code == 0, found
+    assert said in found
 
 
 def test_channel_fits_a_trace_and_speaks_netem(agv_ncs: AgvNcs, tmp_path: Path) -> None:

@@ -36,7 +36,11 @@ UNITLESS = (
     "speed_scale",
     "slip",
     "slip_noise",
-    *(f"{link}.{name}" for link in ("uplink", "downlink") for name in (*"prhk", "arguments", "correlation")),
+    *(
+        f"{link}.{name}"
+        for link in ("uplink", "downlink")
+        for name in (*"prhk", "arguments", "correlation", "hole_loss", "duplicate")
+    ),
 )
 """The only doubles without a unit."""
 
@@ -153,7 +157,20 @@ def test_what_can_change_while_running() -> None:
     losses = {
         f"relay.{link}.{name}"
         for link in ("uplink", "downlink")
-        for name in ("p", "r", "h", "k", "n", "start_step", "arguments")
+        for name in (
+            "p",
+            "r",
+            "h",
+            "k",
+            "n",
+            "start_step",
+            "arguments",
+            "hole_loss",
+            "margin",
+            "delay",
+            "jitter",
+            "duplicate",
+        )
     }
     assert changing == gains | losses
 

@@ -18,6 +18,7 @@ from agv_analysis.convergence import wrapped
 from agv_analysis.recording import read_run
 from agv_analysis.scenario import load_scenario
 from agv_ros.errors import UserError
+from agv_ros.wire import DELAYED, DELIVERED, LOST, decode_slot, encode_slot
 
 REPOSITORY = Path(__file__).parents[1]
 SAMPLE = REPOSITORY / "bags/sample"
@@ -69,6 +70,51 @@ def test_the_sample_bag_is_whole() -> None:
     assert run.pose[0].tolist() == pytest.approx([0.0, 5.0, np.pi / 2])
     assert run.n_ul.max() == np.where(run.lost, run.n_ul, 0).max() > 0
     assert (run.n_ul == 0).tolist() == (~run.lost).tolist()
+
+
+def test_a_recording_from_before_slots_said_why_says_nothing() -> None:
+    run = read_run(SAMPLE)
+    for link in (run.uplink, run.downlink):
+        assert link is not None
+        assert not link.cause.any()
+        assert not link.delay.any()
+        assert np.isnan(link.gain).all()
+    assert run.n_dl is not None
+    assert not run.n_dl.any()
+
+
+def test_a_note_is_read_as_far_as_it_can_be(tmp_path: Path) -> None:
+    notes = {
+        3: "cause=rayleigh run=2 gain=-23.50", 4: "gain=x delay=y state=1", 5: "what = is this", 6: "", 7: "gain=inf",
+    }  # fmt: skip
+
+    def noted(topic: str, k: int, data: bytes) -> list[bytes]:
+        if topic != "/edge/slot" or k not in notes:
+            return [data]
+        return [encode_slot(decode_slot(data)._replace(verdict=LOST if k == 3 else DELIVERED, note=notes[k]))]
+
+    run = read_run(changed_bag(tmp_path / "bag.mcap", noted))
+    assert run.uplink is not None
+    assert run.uplink.cause[2:9].tolist() == ["", "rayleigh", "", "", "", "", ""]
+    assert run.uplink.state[2:9].tolist() == [0, 0, 1, 0, 0, 0, 0]
+    assert run.uplink.delay[2:9].tolist() == [0] * 7
+    np.testing.assert_array_equal(run.uplink.gain[2:9], [np.nan, -23.5, np.nan, np.nan, np.nan, np.inf, np.nan])
+
+
+@pytest.mark.parametrize("arrives", [False, True])
+def test_a_late_pose_is_missed_only_if_the_recording_goes_on_until_it_comes(tmp_path: Path, arrives: bool) -> None:
+    """Slot 1990 says that its pose comes eight slots later, before the last one, or nine: the run had ended."""
+
+    def late(topic: str, k: int, data: bytes) -> list[bytes]:
+        if topic == "/edge/pose" and k == 1990:
+            return []
+        if topic == "/edge/slot" and k == 1990:
+            return [encode_slot(decode_slot(data)._replace(verdict=DELAYED, note=f"delay={8 if arrives else 9}"))]
+        return [data]
+
+    run = read_run(changed_bag(tmp_path / "bag.mcap", late))
+    assert not run.lost[1990]
+    assert run.unexplained == ({"edge/pose": 1} if arrives else {})
 
 
 def test_recorded_errors_are_those_of_the_pose_that_the_edge_held() -> None:

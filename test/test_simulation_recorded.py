@@ -36,6 +36,29 @@ RUNS = {
     "slows down in outages": (
         "relay.downlink.model=burst", "relay.downlink.n=9", "plant.downlink_policy=ramp", "plant.ramp_time=0.03",
     ),
+    "a hole": (
+        "relay.uplink.model=coverage_hole", "relay.uplink.hole_circles=[0.0, 5.5, 0.5, 0.0, 1.0, 0.5]",
+        "relay.uplink.hole_loss=0.9", "relay.downlink.model=coverage_hole", "relay.downlink.p=0.2",
+        "relay.downlink.hole_polygons=[-1.0, 0.5, 1.0, 0.5, 0.0, 2.0, -1.0, 0.5]",
+    ),
+    "fading": (
+        "relay.uplink.model=rayleigh", "relay.uplink.margin=5.0", "relay.downlink.model=rayleigh",
+        "relay.downlink.margin=8.0", "relay.downlink.correlation=0.6", "error_detector.policy=align",
+    ),
+    "late": ("relay.uplink.delay=0.0149", "relay.downlink.delay=0.01", *LOSSY, "plant.downlink_policy=ramp"),
+    "out of order": (
+        *LOSSY, "relay.uplink.delay=0.02", "relay.uplink.jitter=0.03", "relay.uplink.duplicate=0.3",
+        "relay.downlink.jitter=0.02", "relay.downlink.duplicate=0.2", "controller.kx=5.0",
+    ),
+    "out of order, predicted": (
+        *LOSSY, "relay.uplink.delay=0.02", "relay.uplink.jitter=0.03", "relay.downlink.delay=0.012",
+        "error_detector.policy=predict", "plant.lag=0.02", "controller.v_max=6.0",
+    ),
+    "by a schedule": (
+        "relay.uplink.model=gilbert_elliott", "relay.uplink.r=0.3",
+        "relay.uplink.schedule=0.5: p=0.1; 1: outage=0.05 every 0.4; 2: p=0; 2: delay=0.01; 2.5: outage=0",
+        "relay.downlink.schedule=1.2: outage=0.1",
+    ),
     "a heavy AGV": (*LOSSY, "plant.a_max=3.0", "plant.lag=0.02", "plant.w_max=1.5", "error_detector.track=eight"),
     "smooth, in parts": (*LOSSY, "plant.j_max=400.0", "plant.a_max=20.0", "plant.substeps=5", "plant.lag=0.01"),
     "slips and skids": (
@@ -97,8 +120,14 @@ def agree(recorded: Run) -> None:
     """Is the simulation of a recorded run's scenario that run, step by step?"""
     simulated = simulate(recorded.scenario)
     assert len(recorded) == len(simulated) == round(recorded.scenario.plant.duration / recorded.ts)
-    for verdict in ("lost", "downlink_lost", "n_ul"):
+    for verdict in ("lost", "downlink_lost", "n_ul", "n_dl"):
         assert np.array_equal(getattr(recorded, verdict), getattr(simulated, verdict)), verdict
+    for said, true in ((recorded.uplink, simulated.uplink), (recorded.downlink, simulated.downlink)):
+        assert said is not None
+        assert true is not None
+        for fact in ("cause", "state", "delay"):
+            assert np.array_equal(getattr(said, fact), getattr(true, fact)), fact
+        np.testing.assert_allclose(said.gain, true.gain, rtol=0.0, atol=0.00501)
     assert (recorded.measured is None) == (simulated.measured is None)
     np.testing.assert_allclose(recorded.pose, simulated.pose, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(recorded.sent_pose, simulated.sent_pose, rtol=0.0, atol=1e-9)

@@ -40,7 +40,7 @@ def command(
 ) -> None:
     """Say what a channel of the params file PARAMS does to its messages, beside what theory expects.
 
-    The slots are those that a run with the file's seed meets.
+    The slots are those that a run with the file's seed meets; where it matters, with the AGV on its reference.
 
     \b
     Examples:
@@ -55,10 +55,12 @@ def command(
     from agv_analysis.channel_netem import to_netem
     from agv_analysis.channel_study import draw, fitted, study, write_csv
     from agv_analysis.scenario import load_scenario
+    from agv_analysis.simulation.single import reference_of
     from agv_plant.channels.trace import load_trace
     from agv_ros.errors import UserError
 
-    relay = load_scenario(params, settings).relay
+    scenario = load_scenario(params, settings)
+    relay = scenario.relay
     channel = relay.downlink if link == "downlink" else relay.uplink
     if fit is not None and from_netem is not None:
         raise UserError("--fit and --from-netem both name a channel: give one of them")
@@ -71,7 +73,8 @@ def command(
     if netem:
         click.echo(to_netem(channel))
         return
-    found = study(channel, relay.seed, link, slots, relay.ts)
+    places = reference_of(scenario.error_detector, slots)[:, :2] if channel.is_placed else None
+    found = study(channel, relay.seed, link, slots, relay.ts, places)
     table = Table(box=None, pad_edge=False)
     for column in ("", "these slots", "closed form"):
         table.add_column(column, style=None if column else "bold")
@@ -94,9 +97,13 @@ def command(
 
 _SHOWN = {
     "bernoulli": ("p",), "gilbert_elliott": ("p", "r", "h", "k"), "burst": ("n", "start_step"),
-    "trace": ("trace_file", "trace_end"),
+    "trace": ("trace_file", "trace_end"), "coverage_hole": ("p", "hole_loss", "hole_circles", "hole_polygons"),
+    "rayleigh": ("carrier", "margin"),
 }  # fmt: skip
 """The parameters that say what a model does."""
+
+_ON_TOP = ("delay", "jitter", "duplicate", "schedule")
+"""Those that say what comes on top of it, unless they are empty."""
 
 _AGES = (1, 2, 5, 10, 20, 50, 100)
 """The ages whose probability is printed; --csv writes all."""
@@ -104,21 +111,24 @@ _AGES = (1, 2, 5, 10, 20, 50, 100)
 
 def setting(found: ChannelStudy) -> str:
     """Model and parameters as text, as in `bernoulli, p 0.3`."""
-    shown = _SHOWN.get(found.channel.model, ())
+    changed = [name for name in _ON_TOP if getattr(found.channel, name)]
+    shown = (*_SHOWN.get(found.channel.model, ()), *changed)
     return ", ".join([found.channel.model, *(f"{name} {getattr(found.channel, name)}" for name in shown)])
 
 
 def rows(found: ChannelStudy) -> Iterator[tuple[str, str, str]]:
     """Name, what the slots give and what theory expects, as text; the last is a dash where nothing is known."""
-    outages, chain = found.outages, found.chain
+    outages, theory = found.outages, found.expected
 
     def pair(name: str, measured: float, expected: float | None, unit: str) -> tuple[str, str, str]:
         return name, f"{measured:.5g}{unit}", "-" if expected is None else f"{expected:.5g}{unit}"
 
-    yield pair("Loss rate", outages.loss_rate, None if chain is None else chain.loss_rate, "")
-    yield pair("Mean outage", outages.mean_burst, None if chain is None else chain.mean_burst, " slots")
+    yield pair("Loss rate", outages.loss_rate, theory.loss_rate, "")
+    yield pair("Mean outage", outages.mean_burst, theory.mean_burst, " slots")
     yield "Longest outage", f"{outages.longest} slots", "-"
-    yield pair("Mean n_ul", outages.age.mean, None if chain is None else chain.mean_age, " slots")
+    yield pair("Mean n_ul", outages.age.mean, theory.mean_age, " slots")
+    if found.channel.delays:
+        yield pair("Late", found.late, None, " of what is not lost")
     measured, expected = found.age_shares, found.expected_age_shares
     for n in _AGES:
         if n < len(measured):

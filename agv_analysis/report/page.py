@@ -19,7 +19,7 @@ from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
 from agv_analysis.run import Run
-from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE
+from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 from agv_analysis.version import version
 from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
@@ -49,6 +49,8 @@ def sentence(analysis: Observations) -> str:
             f"The AGV keeps to its track on a radio link like this one, but not in every case: {met}, again and again, "
             "would throw it off."
         )
+    if word == UNKNOWN:
+        return "Whether the loop is stable cannot be said: messages were late, which the criteria do not cover."
     if word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
     return f"The AGV does not keep to its track: {met} are too much for these gains."

@@ -24,6 +24,7 @@ from agv_analysis.simulation.loop import (
     statistics_of_twins,
     statistics_of_two,
 )
+from agv_analysis.simulation.on_air import Marks, blank, contraction_on_air, statistics_on_air
 from agv_analysis.simulation.single import reference_of, settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
@@ -38,7 +39,7 @@ STATISTICS = np.dtype([
 """
 
 Table = NDArray[np.void]
-Airs = Callable[[int, int], Air]
+Airs = Callable[[int, int, float], Air]
 Job = tuple[int, int]
 """One run: (row, column) of the table, that is, scenario and seed."""
 
@@ -113,7 +114,11 @@ class _Batch:
         return len(unit)
 
     def _by_twos(self, reference: Floats, jobs: list[Job], airs: Airs) -> Iterator[tuple[Job, Statistics, float]]:
-        for one, other in zip_longest(jobs[::2], jobs[1::2]):
+        direct = [job for job in jobs if self._is_direct(job)]
+        for job in jobs:
+            if not self._is_direct(job):
+                yield job, self._on_air(reference, job, airs)[0], math.nan
+        for one, other in zip_longest(direct[::2], direct[1::2]):
             if other is None:
                 yield one, compiled(statistics)(reference, self._case(one, airs)), math.nan
             else:
@@ -124,7 +129,28 @@ class _Batch:
     def _with_twins(self, reference: Floats, jobs: list[Job], airs: Airs) -> Iterator[tuple[Job, Statistics, float]]:
         for job in jobs:
             twin = at_rest(*(value + TWIN_OFFSET for value in self._scenarios[job[0]].plant.initial_pose))
-            yield job, *compiled(statistics_of_twins)(reference, self._case(job, airs), twin)
+            if self._is_direct(job):
+                yield job, *compiled(statistics_of_twins)(reference, self._case(job, airs), twin)
+            else:
+                found, marks = self._on_air(reference, job, airs)
+                is_whole = found.steps == self._steps[job[0]]
+                case = self._case(job, airs)
+                yield job, found, compiled(contraction_on_air)(reference, case, twin, *marks) if is_whole else math.inf
+
+    def _is_direct(self, job: Job) -> bool:
+        relay = self._scenarios[job[0]].relay
+        return relay.uplink.is_direct and relay.downlink.is_direct
+
+    def _on_air(self, reference: Floats, job: Job, airs: Airs) -> tuple[Statistics, tuple[Marks, Marks]]:
+        """One run whose links have to be asked in the loop, and what became of its messages."""
+        air, relay, steps = self._air(job, airs), self._scenarios[job[0]].relay, self._steps[job[0]]
+        marks = blank(steps), blank(steps)
+        ways = air.way(relay.uplink, "uplink"), air.way(relay.downlink, "downlink")
+        return compiled(statistics_on_air)(reference, self._case(job, airs), *ways, *marks), marks
+
+    def _air(self, job: Job, airs: Airs) -> Air:
+        row, column = job
+        return airs(self._seeds[column], self._steps[row], self._scenarios[row].plant.ts)
 
     def _reference(self, row: int) -> Floats:
         detector = self._scenarios[row].error_detector
@@ -132,8 +158,7 @@ class _Batch:
         return reference
 
     def _case(self, job: Job, airs: Airs) -> Case:
-        row, column = job
-        scenario, air = self._scenarios[row], airs(self._seeds[column], self._steps[row])
+        scenario, air = self._scenarios[job[0]], self._air(job, airs)
         return Case(
             numbers(air.verdicts(scenario.relay.uplink, "uplink")),
             numbers(air.verdicts(scenario.relay.downlink, "downlink")),

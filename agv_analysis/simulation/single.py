@@ -12,14 +12,15 @@ from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.chance import measurements, normals
-from agv_analysis.simulation.loop import Case, Settings, at_rest, history
+from agv_analysis.simulation.link import SimulatedLink
+from agv_analysis.simulation.loop import Case, Rows, Settings, at_rest, history
+from agv_analysis.simulation.on_air import history_on_air
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference
 from agv_cloud.staleness import POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.motion import NOISE, SLIP, body_of
 from agv_plant.parameters import PlantParameters
-from agv_plant.radio import losses
 from agv_ros.errors import UserError
 
 _PAPERS_BODY = body_of(PlantParameters())
@@ -31,30 +32,45 @@ def simulate(scenario: Scenario) -> Run:
     Raises UserError if the run has no end, TrackFileError for a bad track file. A loop that leaves the range of numbers
     ends there, and its run says so in its notes.
     """
-    steps, relay = steps_of(scenario), scenario.relay
+    steps, relay, plant = steps_of(scenario), scenario.relay, scenario.plant
     reference = reference_of(scenario.error_detector, steps).copy()
-    lost = losses(relay.uplink, relay.seed, "uplink", steps)
-    downlink_lost = losses(relay.downlink, relay.seed, "downlink", steps)
-    rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
-    plant, start, settings = scenario.plant, at_rest(*scenario.plant.initial_pose), settings_of(scenario)
+    up, down = (
+        SimulatedLink(channel, relay.seed, name, steps, plant.ts)
+        for name, channel in (("uplink", relay.uplink), ("downlink", relay.downlink))
+    )
+    settings = settings_of(scenario)
     noise = numbers(normals(plant.seed, NOISE, steps)) if plant.is_noisy else None
     slip = numbers(normals(plant.seed, SLIP, steps)) if plant.slip_noise > 0.0 else None
-    case = Case(numbers(lost), numbers(downlink_lost), start, settings, noise, slip)
-    done = compiled(history)(numbers(reference), case, rows, n_ul)
-    pose = rows[:done, 0:3]
+    start, lost = at_rest(*plant.initial_pose), (numbers(up.lost), numbers(down.lost))
+    rows, done = _drive(numbers(reference), Case(*lost, start, settings, noise, slip), up, down)
+    pose, k = rows[:done, 0:3], np.arange(done)
     return Run(
         scenario=scenario,
-        k=np.arange(done),
+        k=k,
         pose=pose,
         measured=measurements(pose, noise, plant.noise_xy, plant.noise_theta) if noise is not None else None,
         reference=reference[:done],
         error=rows[:done, 3:6],
         command=rows[:done, 6:8],
-        n_ul=n_ul[:done],
-        lost=lost[:done],
-        downlink_lost=downlink_lost[:done],
+        n_ul=k - up.marks.held[:done],
+        lost=up.marks.lost[:done],
+        downlink_lost=down.marks.lost[:done],
+        n_dl=k - down.marks.held[:done],
+        uplink=up.slots(done),
+        downlink=down.slots(done),
         notes=tuple(_notes(scenario, done, steps, rows[:done, 6:8])),
     )
+
+
+def _drive(reference: Rows, case: Case, up: SimulatedLink, down: SimulatedLink) -> tuple[Floats, int]:
+    """X_c, eps and u of a run's slots, shape (N, 8), and the number of slots until it ended; the links get their marks.
+
+    Where a message that is not lost is there at once, verdicts known beforehand are all that is needed of the radio.
+    """
+    rows = np.empty((len(reference), 8))
+    if up.is_direct and down.is_direct:
+        return rows, compiled(history)(reference, case, rows, np.empty(len(rows), dtype=np.int64))
+    return rows, compiled(history_on_air)(reference, case, up.way, down.way, up.marks, down.marks, rows)
 
 
 def reference_of(detector: ErrorDetectorParameters, steps: int) -> Floats:

@@ -17,10 +17,15 @@ from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.simulation.chance import normals
+from agv_analysis.simulation.on_air import Way
 from agv_plant.channels import GOOD, MODELS
+from agv_plant.channels.delay import delays_of, soonest
 from agv_plant.channels.installed import TRACE, find_model
+from agv_plant.channels.placed import floor_of, kind_of, levels_of
+from agv_plant.channels.schedule import Segment, is_scripted, segments_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import draws, losses
+from agv_plant.radio import delay_draws, draws, losses
+from agv_ros.parameters import LoopParameters
 
 Verdicts = NDArray[np.bool_]
 
@@ -31,32 +36,55 @@ _Numbers = namedtuple("_Numbers", _NUMERIC)  # type: ignore[misc]  # numba knows
 class Air:
     """Channels under one seed; keeps the random numbers and the latest verdicts, which many runs share."""
 
-    def __init__(self, seed: int, steps: int) -> None:
+    def __init__(self, seed: int, steps: int, ts: float = LoopParameters.ts) -> None:
         self._steps = steps
         self._seed = seed
+        self._ts = ts
         self._shared = functools.cache(lambda stream: draws(ChannelParameters(), seed, stream, 0, steps))
+        self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
+        self._ways = functools.lru_cache(maxsize=8)(self._way)
         self.normals = functools.cache(lambda stream: normals(seed, stream, steps))
         """Normal numbers of a stream of the AGV's, shape (steps, DRAWS)."""
-        self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
 
     def verdicts(self, channel: ChannelParameters, stream: str) -> Verdicts:
-        """Verdicts of the slots 0 .. steps - 1, True where lost, shape (steps,); not to be written to."""
+        """Verdicts of the slots 0 .. steps - 1, True where lost, shape (steps,); not to be written to.
+
+        Of a channel that asks for the place: what is lost wherever the AGV is.
+        """
         return self._verdicts(channel, stream)
+
+    def way(self, channel: ChannelParameters, stream: str) -> Way:
+        """All that a link needs to be asked slot by slot."""
+        return self._ways(channel, stream)
+
+    def _way(self, channel: ChannelParameters, stream: str) -> Way:
+        lost, random = self.verdicts(channel, stream), self._draws(channel, stream)
+        return way_of(channel, self._seed, stream, lost, random, self._ts)
 
     def _judge(self, channel: ChannelParameters, stream: str) -> Verdicts:
         if channel.model == TRACE:  # nothing to compute
-            return losses(channel, self._seed, stream, self._steps)
+            return losses(channel, self._seed, stream, self._steps, self._ts)
         lost = np.zeros(self._steps, dtype=np.bool_)
-        if channel.model != "perfect":  # which needs no random numbers
-            parameters = _Numbers(*(getattr(channel, name) for name in _NUMERIC))
+        if channel.model != "perfect" and not channel.is_placed:
             try:
-                _judge_all(channel.model)(parameters, numbers(self._draws(channel, stream)), lost)
+                self._ask(channel, stream, lost)
             except Exception:
                 if channel.model in MODELS:
                     raise
                 # Another package's model may be more than numba compiles: slot by slot it is the same, or says why not.
-                return losses(channel, self._seed, stream, self._steps)
+                return losses(channel, self._seed, stream, self._steps, self._ts)
+        for segment, end in _segments(channel, self._steps, self._ts):
+            if segment.outage.length > 0.0:
+                compiled(_script)(lost, segment.first, end, *segment.outage, self._ts)
+        lost[0] = False  # slot 0 never is
         return lost
+
+    def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
+        """Ask the channel's model, slot by slot."""
+        random, state = numbers(self._draws(channel, stream)), GOOD
+        for segment, end in _segments(channel, self._steps, self._ts):
+            parameters = _Numbers(*(getattr(segment.channel, name) for name in _NUMERIC))
+            state = _judge_all(channel.model)(parameters, random, lost, segment.first, end, state)
 
     def _draws(self, channel: ChannelParameters, stream: str) -> NDArray[np.float64]:
         if channel.correlation == 0.0:
@@ -64,14 +92,51 @@ class Air:
         return draws(channel, self._seed, stream, 0, self._steps)
 
 
+def way_of(
+    channel: ChannelParameters, seed: int, stream: str, lost: Verdicts, random: NDArray[np.float64], ts: float
+) -> Way:
+    """A link from what is lost wherever the AGV is, shape (N,), and the channel's random numbers, shape (N, DRAWS)."""
+    steps = len(lost)
+    levels, waits = np.empty((steps, 2)), np.zeros(steps, dtype=np.int64)
+    for segment, end in _segments(channel, steps, ts):
+        now = segment.channel
+        levels[segment.first : end] = levels_of(now)
+        if now.delay + now.jitter > 0.0:
+            delays = numbers(delay_draws(seed, stream, segment.first, end - segment.first))
+            waits[segment.first : end] = compiled(_waits)(
+                delays, segment.first, now.delay, now.jitter, now.duplicate, ts
+            )
+    floor = np.array(floor_of(channel, seed, stream) if channel.is_placed else [], dtype=np.float64).reshape(-1, 5)
+    return Way(numbers(lost), kind_of(channel.model), numbers(floor), numbers(levels), numbers(random), numbers(waits))
+
+
+def _segments(channel: ChannelParameters, steps: int, ts: float) -> list[tuple[Segment, int]]:
+    """Segments of a channel that begin within a run, each with the slot before which it ends."""
+    found = [segment for segment in segments_of(channel, ts) if segment.first < steps]
+    return list(zip(found, [*(segment.first for segment in found[1:]), steps], strict=True))
+
+
 @functools.cache
-def _judge_all(name: str) -> Callable[[Any, Any, Verdicts], None]:
+def _judge_all(name: str) -> Callable[[Any, Any, Verdicts, int, int, int], int]:
     model: Any = find_model(name)
 
-    def judge_all(channel: Any, random: Any, lost: Verdicts) -> None:
-        state = GOOD
-        for k in range(len(lost)):
+    def judge_all(channel: Any, random: Any, lost: Verdicts, first: int, end: int, state: int) -> int:
+        for k in range(first, end):
             lost[k], state = model(channel, k, random[k], state)
-        lost[0] = False  # slot 0 never is
+        return state
 
     return compiled(judge_all)
+
+
+def _script(lost: Verdicts, first: int, end: int, at: float, length: float, period: float, ts: float) -> None:
+    for k in range(first, end):
+        lost[k] = lost[k] or is_scripted(k, at, length, period, ts)
+
+
+def _waits(random: Any, first: int, delay: float, jitter: float, duplicate: float, ts: float) -> NDArray[np.int64]:
+    waits = np.empty(len(random), dtype=np.int64)
+    for i in range(len(random)):
+        u_delay, u_twice, u_copy, _ = random[i]
+        message, copy = delays_of(first + i, u_delay, u_twice, u_copy, delay, jitter, duplicate, ts)
+        waits[i] = soonest(message, copy)
+    return waits

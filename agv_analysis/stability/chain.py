@@ -104,8 +104,11 @@ def shortest_mean_burst(loss_rate: float) -> float:
 def chain_of(channel: ChannelParameters) -> Chain | None:
     """The chain of a channel's parameters; None for a model that is no finite Markov chain.
 
-    A single outage (burst with a start_step) is over some day: to the long run the channel is perfect.
+    A single outage (burst with a start_step) is over some day: to the long run the channel is perfect. What a schedule
+    changes is no chain.
     """
+    if channel.schedule:
+        return None
     if channel.model == "perfect" or (channel.model == "burst" and channel.start_step >= 0):
         return bernoulli(0.0)
     if channel.model == "bernoulli":

@@ -190,7 +190,14 @@ def left_out(scenario: Scenario) -> tuple[str, ...]:
     values = {f"plant.{name}": value for name, value in as_dict(scenario.plant).items()}
     usual = {f"plant.{name}": value for name, value in as_dict(PlantParameters()).items()}
     found = [name for name in values if name not in _KNOWN_TO_CRITERIA and values[name] != usual[name]]
-    return tuple(f"{name} is {values[name]}" for name in found)
+    links = {"uplink": scenario.relay.uplink, "downlink": scenario.relay.downlink}
+    on_top = [
+        f"relay.{link}.{name} is {value}"
+        for link, channel in links.items()
+        for name in ("delay", "jitter", "schedule")
+        if (value := getattr(channel, name))
+    ]
+    return (*(f"{name} is {values[name]}" for name in found), *on_top)
 
 
 def _largest_constant_delay(

@@ -8,6 +8,9 @@ The criteria are asked from the strongest statement to the weakest:
 - `bounded`: neither, but the speed is limited, which makes a bounded limit cycle of what would otherwise grow;
 - `unstable`: neither, and nothing bounds the error.
 
+Outages end with a fresh pose; where messages are late none is. A constant delay is judged by the lifted system, any
+other is `unknown`.
+
 The Floquet multiplier of the run's own sequence of losses stands beside the verdict and does not enter it: it says what
 those losses did to a small error in that one run. Where the mean square grows, most runs may still contract; and a run
 that is short, or ends inside an outage, may have a multiplier above 1 in a loop that contracts under any such outages.
@@ -18,6 +21,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
+UNKNOWN = "unknown"
+"""For a run in which messages were late by more than one constant delay: no criterion here covers it."""
 
 
 @dataclass(frozen=True)
@@ -46,3 +51,21 @@ def judge(n: int, n_bursts: int | None, mean_square_growth: float, burst_left: f
     if v_max < float("inf"):
         return Verdict(BOUNDED, "v_max", f"none: {beyond}; only the limit on the speed bounds the error")
     return Verdict(UNSTABLE, "mean_square", f"none: {beyond}, and under the fitted channel the mean square grows")
+
+
+def judge_late(n: int | None, radius: float, v_max: float) -> Verdict:
+    """Verdict on a run in which messages were late.
+
+    n: the constant outdatedness of the pose [slots], None if it was not constant or commands were late as well; radius:
+    spectral radius of the lifted system for it; v_max: limit on the speed [m/s].
+    """
+    if n is None:
+        return Verdict(UNKNOWN, "none", "unknown: messages were late, by no constant delay, which no criterion covers")
+    if radius < 1.0:
+        return Verdict(
+            ASYMPTOTIC, "lifted", f"each pose is {n} steps old, and the error shrinks; see n_max of stability"
+        )
+    late = f"none: each pose is {n} steps old, and the error grows"
+    if v_max < float("inf"):
+        return Verdict(BOUNDED, "v_max", f"{late}; only the limit on the speed bounds it")
+    return Verdict(UNSTABLE, "lifted", late)

@@ -6,6 +6,7 @@ import functools
 from importlib.metadata import EntryPoint, entry_points
 
 from agv_plant.channels import MODELS, Model
+from agv_plant.channels.placed import PLACED
 from agv_ros.errors import UserError
 
 GROUP = "agv_ncs.channels"
@@ -28,19 +29,19 @@ def _installed() -> dict[str, tuple[EntryPoint, ...]]:
 
 def known_models() -> tuple[str, ...]:
     """Names of all models: those of this package, then those of other installed ones."""
-    own = (*MODELS, TRACE)
+    own = (*MODELS, TRACE, *PLACED[1:])
     return (*own, *(name for name in _installed() if name not in own))
 
 
 @functools.cache
 def find_model(name: str) -> Model:
-    """The model called `name`, which is one of `known_models` but not `trace`.
+    """The model called `name`, which is one of `known_models` but neither `trace` nor one of `PLACED`.
 
     Raises ChannelError if two models have this name or if another package's model cannot be imported.
     """
     points = _installed().get(name, ())
     sources = [f"{point.value} of another package" for point in points]
-    if name in MODELS or name == TRACE:
+    if name in (*MODELS, TRACE, *PLACED):
         sources.insert(0, "that of agv_ncs")
     if len(sources) > 1:
         raise ChannelError(f"two channel models are called {name}: {' and '.join(sources)}; rename one")

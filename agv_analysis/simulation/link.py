@@ -1,0 +1,59 @@
+"""One direction of the radio in a single run, of which everything is kept."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from agv_analysis.outages import ages
+from agv_analysis.run import LinkSlots
+from agv_analysis.simulation.on_air import Marks, Way, blank
+from agv_analysis.simulation.verdicts import Air, Verdicts, way_of
+from agv_plant.channels import GOOD
+from agv_plant.channels.schedule import OUTAGE
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio import Channel, draws
+
+
+class SimulatedLink:
+    """A channel under one seed, asked by the loop or beforehand, and what became of its messages."""
+
+    def __init__(self, channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> None:
+        self.lost: Verdicts
+        """What is lost wherever the AGV is, shape (N,)."""
+        if channel.is_placed:
+            self.lost = Air(seed, steps, ts).verdicts(channel, stream)
+            self._cause = np.where(self.lost, OUTAGE, channel.model)
+            self._state = np.full(steps, GOOD)
+        else:
+            relay = Channel(channel, seed, stream, ts)
+            verdicts = [relay.judge(k) for k in range(steps)]
+            self.lost = np.array([verdict.lost for verdict in verdicts], dtype=np.bool_)
+            self._cause = np.array([verdict.cause for verdict in verdicts], dtype=np.str_)
+            self._state = np.array([verdict.state for verdict in verdicts], dtype=np.int64)
+        self.is_direct = channel.is_direct
+        self.marks: Marks = blank(steps)
+        """To be filled by the loop, if the link is not direct."""
+        if self.is_direct:
+            k = np.arange(steps)
+            self.marks.lost[:] = self.lost
+            self.marks.held[:] = k - ages(k, self.lost)
+        self._asked = channel, seed, stream, ts
+
+    @functools.cached_property
+    def way(self) -> Way:
+        """What is needed to ask it in the loop."""
+        channel, seed, stream, ts = self._asked
+        return way_of(channel, seed, stream, self.lost, draws(channel, seed, stream, 0, len(self.lost)), ts)
+
+    def slots(self, count: int) -> LinkSlots:
+        """The first `count` slots."""
+        lost = self.marks.lost[:count]
+        waits = np.zeros(count, dtype=np.int64) if self.is_direct else np.asarray(self.way.waits)[:count]
+        return LinkSlots(
+            cause=np.where(lost, self._cause[:count], ""),
+            state=self._state[:count],
+            gain=self.marks.gain[:count],
+            delay=np.where(lost, 0, waits),
+        )
