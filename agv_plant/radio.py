@@ -104,6 +104,7 @@ class Channel:
         self._parameters = parameters
         self._segments = segments_of(parameters, self._ts)
         self._firsts = [segment.first for segment in self._segments]
+        self._has_outages = any(segment.outage.length > 0.0 for segment in self._segments)
 
     def lost(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> bool:
         """Is the message of slot `k` lost, sent when the AGV is at (x, y) [m]?"""
@@ -112,9 +113,9 @@ class Channel:
     def judge(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> Verdict:
         """The verdict on the message of slot `k`. Slot 0 is never lost: a run begins with the AGV known to the edge."""
         verdict = self._by_place(k, x, y) if self._kind else self._by_slot(k)
-        if verdict.lost and k == 0:
+        if k == 0:
             return verdict._replace(lost=False, cause="")
-        if k > 0 and is_scripted(k, *self._segment(k).outage, self._ts):
+        if self._has_outages and is_scripted(k, *self._segment(k).outage, self._ts):
             return verdict._replace(lost=True, cause=OUTAGE)
         return verdict
 

@@ -22,7 +22,7 @@ class SimulatedLink:
     def __init__(self, channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> None:
         self.lost: Verdicts
         """What is lost wherever the AGV is, shape (N,)."""
-        if channel.is_placed:
+        if channel.is_placed or channel.model == "perfect":  # which nobody has to be asked for
             self.lost = Air(seed, steps, ts).verdicts(channel, stream)
             self._cause = np.where(self.lost, OUTAGE, channel.model)
             self._state = np.full(steps, GOOD)
