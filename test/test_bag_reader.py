@@ -17,7 +17,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from agv_analysis.bags import BagError, read_bag
+from agv_analysis.bags import BagError, mcap_file, read_bag
+from agv_analysis.bags import bag as bag_module
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 REPOSITORY = Path(__file__).parents[1]
@@ -127,6 +128,34 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def test_every_kind_of_mcap_file(tmp_path: Path, variant: str) -> None:
     write_mcap(tmp_path / "bag.mcap", **VARIANTS[variant])
     assert_whole(tmp_path / "bag.mcap")
+
+
+@pytest.fixture
+def as_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of any size are read as large ones are: by compiled code, each topic by a thread of its own."""
+    for module in (bag_module, mcap_file):
+        monkeypatch.setattr(module, "LARGE", 0)
+    monkeypatch.setattr(bag_module, "_MUCH", 0)
+
+
+@pytest.mark.usefixtures("as_large")
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_large_files_are_read_as_small_ones(tmp_path: Path, variant: str) -> None:
+    write_mcap(tmp_path / "bag.mcap", **VARIANTS[variant])
+    assert_whole(tmp_path / "bag.mcap")
+
+
+@pytest.mark.usefixtures("as_large")
+def test_a_topic_of_a_large_file_that_cannot_be_decoded(tmp_path: Path) -> None:
+    """Some of its messages are so long that the array would be out of all proportion to the others."""
+    text = _type(TEXT)
+    parts = [("/chatter", 10**9 + i, text("x" * (1 if i % 1000 else 10**5))) for i in range(2001)]
+    write_mcap(tmp_path / "bag.mcap", [*parts, ("/amcl_pose", 2 * 10**9, pose(1))], **VARIANTS["without summary"])
+    bag = read_bag(tmp_path / "bag.mcap")
+    with pytest.raises(BagError, match="/chatter: cannot be decoded: its strings or sequences differ so much"):
+        bag["/chatter"]
+    assert len(bag["/amcl_pose"]) == 1
+    assert bag.topics["/chatter"].count == 2001
 
 
 def test_what_is_not_checked_is_said(tmp_path: Path) -> None:

@@ -30,6 +30,11 @@ class Batch:
     def __len__(self) -> int:
         return len(self.starts)
 
+    @property
+    def total(self) -> int:
+        """Bytes of all messages together."""
+        return int(self.sizes.sum())
+
     def after(self, first: int, count: int | None = None) -> Batch:
         """The messages from `first` on, `count` at most."""
         part = slice(first, None if count is None else first + count)

@@ -356,7 +356,7 @@ class McapFile:
         if record.opcode == MESSAGE:
             return self._run(record)
         if record.opcode == CHUNK:
-            return _Packed(position, parse_chunk(record.content), []), record.end
+            return self._packed(record)
         if is_known(record.opcode):
             return record, record.end
         content = record.content
@@ -367,6 +367,14 @@ class McapFile:
             raise DamagedError(f"a record of the unknown kind {record.opcode}")
         self.findings.add(f"record of the unknown kind {record.opcode}, passed over", at=position)
         return None, record.end
+
+    def _packed(self, record: Record) -> tuple[_Packed, int]:
+        """A chunk with the sound message indexes that follow it, and where they end."""
+        packed, position = _Packed(record.position, parse_chunk(record.content), []), record.end
+        while (found := self._source.index(position)) is not None:
+            index, position = found
+            packed.indexes.append(index)
+        return packed, position
 
     def _run(self, first: Record) -> tuple[_Run, int]:
         """Messages outside of chunks, as many as follow each other within a window, and where the next record is."""

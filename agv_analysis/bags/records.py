@@ -53,8 +53,6 @@ def has_shape(opcode: int, length: int, read: Read) -> bool:
     """Do the lengths inside a record of a known kind add up to its own? `read` counts from the record's content."""
     if opcode == MESSAGE:
         return length >= MESSAGE_HEAD
-    if opcode == MESSAGE_INDEX:  # of which there are most
-        return length >= 6 and int.from_bytes(read(2, 4), "little") == length - 6
     position = 0
     for part in _SHAPES[opcode]:
         if part in "bB":

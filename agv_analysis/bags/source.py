@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from agv_analysis.bags.compression import MAX_CHUNK
 from agv_analysis.bags.errors import BagError, DamagedError
-from agv_analysis.bags.records import MAGIC, MESSAGE, RECORD, has_shape, is_known
+from agv_analysis.bags.records import MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, Index, has_shape, is_known
 
 _AHEAD = 2**18
 """Bytes that are read at least: a chunk with its message indexes, as a rule."""
@@ -17,6 +20,9 @@ _AHEAD = 2**18
 _WINDOW = 2**22
 _MAX_CANDIDATES = 200_000
 """So many places of a file are looked at in search of records; more only a file made for the purpose has."""
+
+_INDEX_HEAD = struct.Struct("<BQHI")
+"""Opcode, length, channel and bytes of entries of a message index, the commonest record outside of chunks."""
 
 _RECORD_START = re.compile(rb"(?=[\x01-\x0f].{5}\x00{3})", re.DOTALL)
 """A known opcode, and a length below 2^40."""
@@ -97,6 +103,17 @@ class Source:
         if is_known(opcode) and not has_shape(opcode, length, lambda at, count: content[at : at + count]):
             raise DamagedError("a record whose lengths contradict each other")
         return Record(position, opcode, content)
+
+    def index(self, position: int) -> tuple[Index, int] | None:
+        """The message index at `position`, and where it ends; None if there is anything else, or a damaged one."""
+        head = self.read(position, _INDEX_HEAD.size)
+        if len(head) < _INDEX_HEAD.size:
+            return None
+        opcode, length, channel, size = _INDEX_HEAD.unpack(head)
+        begin = position + _INDEX_HEAD.size
+        if opcode != MESSAGE_INDEX or length != 6 + size or size % 16 or begin + size > self.size:
+            return None
+        return Index(channel, np.frombuffer(self.read(begin, size), "<i8")[1::2]), begin + size
 
     def is_record(self, position: int, depth: int = 3) -> bool:
         """Is there a record of a known kind at `position`? A message must be followed by others, or by the end."""

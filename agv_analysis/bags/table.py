@@ -104,7 +104,7 @@ class Table:
         Raises UndecodableError if none of the topic's messages is of its type, or if the array would grow out of all
         proportion to its messages.
         """
-        self._message_bytes += int(batch.sizes.sum())
+        self._message_bytes += batch.total
         done = 0
         while self._place is not None and done < len(batch):
             rest = batch.after(done) if done else batch
