@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
 import os
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.request import Request, urlopen
 
 import numpy as np
 import pytest
@@ -43,12 +48,23 @@ def test_a_page_that_nobody_has_touched_is_the_scenario_of_the_file(base: Scenar
 
 
 def test_what_a_slider_says_arrives_in_the_scenario(base: Scenario) -> None:
-    moved = {"kx": 40, "ts": 10, "v_max": 6, "ahead": 1.5, "left": -0.5, "n": 3, "seed": 9, "track": "eight"}
+    moved = {
+        "kx": 40,
+        "ts": 10,
+        "v_max": 6,
+        "ahead": 1.5,
+        "left": -0.5,
+        "n": 3,
+        "seed": 9,
+        "track": "eight",
+        "delay": 30,
+    }
     found = scenario_of(base, {**values_of(base), **moved, "more": " plant.duration=50\n\nplant.integration=arc"})
     assert (found.controller.kx, found.plant.ts, found.controller.v_max) == (40.0, 0.01, 6.0)
     # the track starts northwards: ahead is y, left is -x
     np.testing.assert_allclose(found.plant.initial_pose[:2], (0.5, 1.5), atol=1e-12)
     assert (found.relay.uplink.n, found.relay.seed, found.error_detector.track) == (3, 9, "eight")
+    assert found.relay.uplink.delay == 0.03
     assert (found.plant.duration, found.plant.integration) == (50.0, "arc")
     again = {key: value for key, value in values_of(found).items() if key in moved}
     assert again == pytest.approx({k: v for k, v in moved.items() if k != "track"} | {"track": "eight"})
@@ -126,6 +142,24 @@ def test_the_presets_tell_the_story(base: Scenario) -> None:
     assert paper == "holds for any number of outages"
     assert error > 1e3
     assert late("predicted")[0] < 1e-6
+
+
+def test_the_counterexample_is_a_pose_that_is_always_as_old(base: Scenario) -> None:
+    scenario = scenario_of(base, preset_values(base, "missed"))
+    run = simulate(scenario)
+    assert set(run.n_ul[20:].tolist()) == {13}
+    assert not run.lost.any()
+    # the eigenvalues that the preset's text names, of the closed loop with a fresh pose: 1 - a, and (eq. 55) with
+    # b = T_s v K_theta, c = T_s^2 v^2 K_y the roots of mu^2 - b mu + c, of which they are 1 - mu
+    gains, v = scenario.controller, run.reference[-1, 3]
+    b, c = 0.005 * v * gains.ktheta, (0.005 * v) ** 2 * gains.ky
+    found = [1.0 - 0.005 * gains.kx, *(1.0 - np.roots([1.0, -b, c]))]
+    np.testing.assert_allclose(found, [0.875, 0.995, 0.995], atol=1e-6)
+    # a recursion of its own along the track: e(k+1) = e(k) - a e(k-13)
+    e = [-5.0] * 14
+    for _ in range(400):
+        e.append(e[-1] - 0.125 * e[-14])
+    assert max(map(abs, e[-60:])) > max(map(abs, e[100:160]))
 
 
 # -- in the browser ---------------------------------------------------------------------------------------------------
@@ -234,7 +268,7 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
 
 def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     page.click("preset-missed")
-    page.until(lambda: "80 ms" in page.text("told"))
+    page.until(lambda: "13 steps (65 ms)" in page.text("told"))
     page.click("pin")
     page.until(lambda: "pinned" in page.names("track"))
     page.click("preset-predicted")
@@ -284,6 +318,47 @@ def test_the_command_says_where_the_page_is_and_ends_on_ctrl_c(start: Start) -> 
     served.process.send_signal(signal.SIGINT)
     status, said = served.end()
     assert (status, "Traceback" in said) == (0, False), said
+
+
+def ask_for_the_lap(address: str, base: Scenario) -> None:
+    """What the page asks for after a move; the server may go away meanwhile."""
+    from agv_analysis.explore.app import KEYS
+
+    values = values_of(base)
+    inputs = [{"id": key, "property": "value", "value": values[key]} for key in KEYS]
+    inputs.append({"id": "pinned", "property": "data", "value": None})
+    outputs = {"id": "lap", "property": "children"}
+    asked = {"output": "lap.children", "outputs": outputs, "inputs": inputs, "changedPropIds": ["kx.value"]}
+    request = Request(
+        f"{address}_dash-update-component", json.dumps(asked).encode(), {"Content-Type": "application/json"}
+    )
+    with contextlib.suppress(OSError, HTTPException):
+        urlopen(request, timeout=300.0).close()
+
+
+def has_children(pid: int) -> bool:
+    """Has a process begun another? By Linux' /proc, whose processes may go while it is read."""
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
+                return True
+    return False
+
+
+def test_ctrl_c_ends_it_in_the_midst_of_the_lap_s_criteria(start: Start, base: Scenario) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    command = ("agv_analysis.cli", "explore", "config/outages.yaml", "--port", "0", "--no-browser")
+    served = start(*command, start_new_session=True)
+    pid = served.process.pid
+    address = served.wait_for("explore:").split()[1]
+    with ThreadPoolExecutor(1) as threads:
+        threads.submit(ask_for_the_lap, address, base)
+        deadline = time.monotonic() + 120.0
+        while not has_children(pid) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        os.killpg(pid, signal.SIGINT)  # as a terminal does
+        status, said = served.end()
+    assert (status, "Traceback" in said) == (0, False), said[-500:]
 
 
 def test_a_port_that_is_taken_is_named(agv_ncs: Callable[..., tuple[int, str]]) -> None:

@@ -7,6 +7,7 @@ import multiprocessing
 import signal
 import threading
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from typing import Any, Generic, TypeVar
 
 from agv_analysis.explore.answer import under_the_outages_of
@@ -77,16 +78,18 @@ class Newest(Generic[R]):
 
     def _other_process(self) -> Any:
         if self._process is None:
-            # Spawned, since the server has threads. Its end is that of the page's own process.
-            self._process = multiprocessing.get_context("spawn").Pool(1, _leave_signals)
+            # Ctrl-C reaches every process of a terminal, and is the page's own to act upon: a process inherits what is
+            # blocked when it begins. Spawned, since the server has threads; multiprocessing's own tracker, which would
+            # come up with it and take the block away, comes first.
+            resource_tracker.ensure_running()
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                self._process = multiprocessing.get_context("spawn").Pool(1)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return self._process
 
     def close(self) -> None:
         """End the other process, whatever it is at."""
         if self._process is not None:
             self._process.terminate()
-
-
-def _leave_signals() -> None:
-    """Ctrl-C reaches every process of the terminal, and is the page's own to act upon."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
