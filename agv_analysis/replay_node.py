@@ -23,6 +23,9 @@ from agv_ros.wire import Command, TrackingError, decode_command, decode_error, e
 _PATIENCE = 10.0
 """How long [s] the edge may take for an answer, before it is given up."""
 
+_START_PATIENCE = 30.0
+"""How long [s] nodes may take to start and to find each other."""
+
 _TICK = 0.001
 """How often [s] the player looks what is due."""
 
@@ -126,8 +129,8 @@ class ReplayNode(LoopNode[LoopParameters]):
         missing = self._who_is_missing()
         if missing:
             waited = time.monotonic() - self._heard
-            if waited > _PATIENCE:
-                self.fail(f"{missing}, waited for {_PATIENCE:g} s")
+            if waited > _START_PATIENCE:
+                self.fail(f"{missing}, waited for {_START_PATIENCE:g} s")
             elif self._edge_runs and len(self._ears) < min(_EARS, int(waited)) * len(_ANSWERS):
                 self._lend_ears()
             return self.finished
