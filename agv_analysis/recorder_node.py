@@ -16,6 +16,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_analysis.bag_writer import BagWriter, TopicInfo
 from agv_analysis.message_schema import schema_of
@@ -34,8 +35,11 @@ TOPICS: dict[str, type] = {
     "edge/slot": TimeReference,
     "edge/age": TimeReference,
     "edge/error": Odometry,
+    "edge/horizon": MultiDOFJointTrajectory,
     "edge/cmd_vel": TwistStamped,
+    "edge/plan": MultiDOFJointTrajectory,
     "agv/cmd_vel": TwistStamped,
+    "agv/plan": MultiDOFJointTrajectory,
     "agv/slot": TimeReference,
     "/diagnostics": DiagnosticArray,
 }

@@ -127,7 +127,7 @@ def replay_in_process(
         for name, count in listeners.items() if starts_edge else ():
             only = {"trigger": "slot"} if name == "error_detector" else {"command_type": "twist_stamped"}
             given = getattr(scenario, name)
-            settings = dataclasses.replace(given, wait_for_subscribers=count, **only)
+            settings = dataclasses.replace(given, wait_for_subscribers=count, plan_steps=0, **only)
             nodes.append(process.add(NODES[name], settings, use_sim_time=True))
         if bag is not None:
             own = [node.get_fully_qualified_name().lstrip("/") for node in nodes]
@@ -222,7 +222,7 @@ def _connected(scenario: Scenario, recorded: bool) -> Scenario:
         check_length(channel, steps)
     met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": _PATIENCE if recorded else scenario.plant.stop_timeout}
     nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
-    if scenario.error_detector.policy == "predict":  # which listens to the controller's commands as well
+    if scenario.error_detector.policy == "predict" and not scenario.plant.plan_steps:  # which hears commands as well
         nodes["controller"] = dataclasses.replace(nodes["controller"], wait_for_subscribers=2 + recorded)
     return Scenario(**nodes)
 

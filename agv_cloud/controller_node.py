@@ -1,4 +1,4 @@
-"""The controller: a pure function of the tracking error, on the edge."""
+"""The controller: a pure function of the tracking error, on the edge; with a plan, also of the reference ahead."""
 
 from __future__ import annotations
 
@@ -7,32 +7,79 @@ from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
+from agv_cloud.plan import planned_commands
 from agv_ros.executor import run_node
 from agv_ros.message_types import TWIST_STAMPED
 from agv_ros.node import LoopNode
-from agv_ros.wire import Command, decode_error, encode_command, encode_twist
+from agv_ros.speeds_wire import SpeedsAhead, decode_speeds, encode_speeds
+from agv_ros.wire import FRAME_AGV, Command, TrackingError, decode_error, encode_command, encode_twist
+
+_MOST_WAITING = 1000
+"""Errors and horizons that wait for each other at most."""
 
 
 class ControllerNode(LoopNode[ControllerParameters]):
-    """Answers each edge/error with one edge/cmd_vel of the same stamp."""
+    """Answers each edge/error with one edge/cmd_vel of the same stamp; with plans, also with one edge/plan."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("controller", ControllerParameters, **node_options)
         self._is_stamped = self.settings.command_type == TWIST_STAMPED
-        self._cmd_vel = self.output(TwistStamped if self._is_stamped else Twist, "edge/cmd_vel")
-        self.input(Odometry, "edge/error", self._on_error, self._cmd_vel)
+        plans = self.settings.plan_steps > 0
+        kind = TwistStamped if self._is_stamped else Twist
+        self._cmd_vel = self.output(kind, "edge/cmd_vel", side=plans)
+        self._errors: dict[int, TrackingError] = {}
+        self._horizons: dict[int, SpeedsAhead] = {}
+        if plans:
+            self._plan_out = self.output(MultiDOFJointTrajectory, "edge/plan")
+            self.input(Odometry, "edge/error", self._keep_error, self._cmd_vel, self._plan_out)
+            self.input(MultiDOFJointTrajectory, "edge/horizon", self._keep_horizon, self._cmd_vel, self._plan_out)
+        else:
+            self.input(Odometry, "edge/error", self._on_error, self._cmd_vel)
 
     def _on_error(self, data: bytes) -> None:
         error, gains = decode_error(data), self.settings
         self.report_every_second(error.stamp_ns)
         v, w = control_law(error.x_e, error.y_e, error.theta_e, error.v_r, error.w_r, gains.kx, gains.ky, gains.ktheta)
-        command = Command(error.stamp_ns, limit_speed(v, gains.v_max), w)
-        self._cmd_vel.publish(
-            encode_command(command, gains.frame_prefix) if self._is_stamped else encode_twist(command)
-        )
+        self._send(Command(error.stamp_ns, limit_speed(v, gains.v_max), w))
+
+    def _send(self, command: Command) -> None:
+        prefix = self.settings.frame_prefix
+        self._cmd_vel.publish(encode_command(command, prefix) if self._is_stamped else encode_twist(command))
+
+    # -- with a plan -------------------------------------------------------------------------------------------------
+
+    def _keep_error(self, data: bytes) -> None:
+        error = decode_error(data)
+        self._errors[error.stamp_ns] = error
+        self._answer(error.stamp_ns)
+
+    def _keep_horizon(self, data: bytes) -> None:
+        horizon = decode_speeds(data)
+        self._horizons[horizon.stamp_ns] = horizon
+        self._answer(horizon.stamp_ns)
+
+    def _answer(self, stamp_ns: int) -> None:
+        """Answer a step once both its error and the reference ahead are there."""
+        if stamp_ns in self._errors and stamp_ns in self._horizons:
+            self._plan(self._errors.pop(stamp_ns), self._horizons.pop(stamp_ns))
+        for waiting in (self._errors, self._horizons):
+            if len(waiting) > _MOST_WAITING:  # the other topic is dead
+                del waiting[next(iter(waiting))]
+
+    def _plan(self, error: TrackingError, horizon: SpeedsAhead) -> None:
+        gains, stamp_ns = self.settings, error.stamp_ns
+        self.report_every_second(stamp_ns)
+        commands = planned_commands(
+            (error.x_e, error.y_e, error.theta_e), horizon.speeds, (gains.kx, gains.ky, gains.ktheta), gains.v_max,
+            gains.ts, gains.integration == "arc",
+        )  # fmt: skip
+        self._send(Command(stamp_ns, *commands[0]))
+        plan = SpeedsAhead(stamp_ns, tuple(commands))
+        self._plan_out.publish(encode_speeds(plan, self.grid.ts_ns, gains.frame_prefix + FRAME_AGV))
 
 
 def main(args: Sequence[str] | None = None) -> None:

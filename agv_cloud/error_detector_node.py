@@ -14,6 +14,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import TimeReference
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_cloud.freshest_pose import FreshestPose
 from agv_cloud.parameters import ErrorDetectorParameters
@@ -26,6 +27,7 @@ from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
+from agv_ros.speeds_wire import SpeedsAhead, encode_speeds
 from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
 from agv_ros.transforms import TransformBroadcaster
 from agv_ros.wire import (
@@ -62,6 +64,8 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._ready: deque[Joined[Pose]] = deque()
         self._answered = -1
         self._error_out = self.output(Odometry, "edge/error")
+        plans = self.settings.plan_steps > 0
+        self._horizon_out = self.output(MultiDOFJointTrajectory, "edge/horizon") if plans else None
         self._transforms = TransformBroadcaster(self, FRAME_REFERENCE)
         if not self._transforms.available:  # said here only: there is no loop without this node
             self.get_logger().info("tf2_msgs is not installed: no node of this loop publishes transforms on /tf")
@@ -196,8 +200,16 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         eps = tracking_error(target.x, target.y, target.theta, *held)
         self._answered = k
         error = TrackingError(stamp_ns, *eps, now.v, now.w)
+        if self._horizon_out is not None:
+            self._horizon_out.publish(self._horizon(k))
         self._transforms.send(Pose(stamp_ns, now.x, now.y, now.theta))
         self._error_out.publish(encode_error(error, self.settings.frame_prefix))
+
+    def _horizon(self, k: int) -> bytes:
+        """Speeds of the reference from step k on, as far as the controller plans."""
+        points = (self.reference[k + ahead] for ahead in range(self.settings.plan_steps + 1))
+        ahead = SpeedsAhead(self.grid.stamp(k), tuple((point.v, point.w) for point in points))
+        return encode_speeds(ahead, self.grid.ts_ns, self.settings.frame_prefix + FRAME_REFERENCE)
 
     def facts(self) -> dict[str, str]:
         """Slots that were not answered, by reason; or how the edge's clock and the AGV's get along."""

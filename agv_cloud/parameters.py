@@ -70,6 +70,9 @@ class ControllerParameters(LoopParameters):
     kx: float = parameter(25.0, "gain K_x of the error along the track", unit="1/s", low=0.0, high=1e6, runtime=True)
     ky: float = parameter(1.0, "gain K_y of the error across the track", unit="1/m^2", low=0.0, high=1e6, runtime=True)
     ktheta: float = parameter(2.0, "gain K_theta of the error of heading", unit="1/m", low=0.0, high=1e6, runtime=True)
+    integration: str = parameter(
+        "euler", "how the model behind a plan integrates one period, as plant.integration", choices=tuple(STEPS)
+    )
     command_type: str = parameter(
         "twist_stamped",
         "type of edge/cmd_vel; twist_stamped: geometry_msgs/TwistStamped, twist: geometry_msgs/Twist, which without a "

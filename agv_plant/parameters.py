@@ -43,7 +43,8 @@ class PlantParameters(LoopParameters):
     downlink_policy: str = parameter(
         "hold",
         "what the AGV does in a step whose command did not arrive; hold: it obeys the newest one, zero: it stands "
-        "still, ramp: it slows down to a stand within ramp_time",
+        "still, ramp: it slows down to a stand within ramp_time, buffer: it drives what was planned plan_steps ahead, "
+        "then it stands still",
         choices=DOWNLINK_POLICIES,
     )
     ramp_time: float = parameter(0.2, "ramp: time from the newest command to a stand", unit="s", above=0.0, high=3600.0)
@@ -80,6 +81,16 @@ class PlantParameters(LoopParameters):
     seed: int = parameter(
         1, "seed of noise and slip; a sweep's seeds, and agv-ncs run --seed, set it with relay.seed", low=0, high=2**62
     )
+
+    def __post_init__(self) -> None:
+        """Check what no single bound can say."""
+        if self.downlink_policy == "buffer" and self.plan_steps == 0:
+            raise ParameterError("plant.downlink_policy is buffer, but plan_steps is 0: set it, the same on all nodes")
+
+    @property
+    def policy_steps(self) -> float:
+        """Steps until the downlink policy lets the AGV stand, where it has such a number."""
+        return self.plan_steps if self.downlink_policy == "buffer" else self.ramp_time / self.ts
 
     @property
     def is_noisy(self) -> bool:
@@ -157,6 +168,10 @@ class ChannelParameters:
     duplicate: float = parameter(
         0.0, "probability that a message comes a second time, with a delay of its own", low=0.0, high=1.0, runtime=True
     )
+    lifetime: float = parameter(
+        math.inf, "a message that would come older than this never comes, .inf: all come", unit="s", above=0.0,
+        high=math.inf, runtime=True,
+    )  # fmt: skip
     schedule: str = parameter(
         "",
         "what changes in a run, as in '20: p=0.1; 20: outage=0.3 every 5; 60: outage=0': from 20 s on p is 0.1 and all "

@@ -16,6 +16,7 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.held_command import HeldCommand
@@ -27,6 +28,7 @@ from agv_plant.unicycle import State
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
 from agv_ros.slot_join import Joined, SlotJoin
+from agv_ros.speeds_wire import decode_speeds
 from agv_ros.stamps import to_nanoseconds
 from agv_ros.transforms import TransformBroadcaster
 from agv_ros.wire import (
@@ -81,7 +83,11 @@ class PlantNode(LoopNode[PlantParameters]):
         self._clock_out = self.output(Clock, "/clock", side=True)
         self._truth_out = self.output(PoseStamped, "agv/ground_truth", side=True) if settings.is_noisy else None
         self._transforms = TransformBroadcaster(self, FRAME_AGV)
-        self.input(TwistStamped, "agv/cmd_vel", self._on_command)
+        self._plans: dict[int, tuple[tuple[float, float], ...]] = {}
+        if settings.plan_steps:
+            self.input(MultiDOFJointTrajectory, "agv/plan", self._on_plan)
+        else:
+            self.input(TwistStamped, "agv/cmd_vel", self._on_command)
         self.input(TimeReference, "agv/slot", self._on_slot)
         if self._lockstep:
             self._watch_for_answers()
@@ -127,9 +133,13 @@ class PlantNode(LoopNode[PlantParameters]):
     def _advance(self, command: Command) -> None:
         """From step k to k + 1 under the newest command."""
         plant, age = self.settings, (self.grid.stamp(self.k) - command.stamp_ns) // self.grid.ts_ns
-        share = share_of_command(age, self._downlink_policy, plant.ramp_time / plant.ts)
+        v, w = command.v, command.w
+        if plant.downlink_policy == "buffer":
+            plan = self._plan_of(command)
+            v, w = plan[min(age, len(plan) - 1)]
+        share = share_of_command(age, self._downlink_policy, plant.policy_steps)
         n_left, n_right = self._slip.at(self.k)[:2] if plant.slip_noise > 0.0 else (0.0, 0.0)
-        motion = move(self._motion, share * command.v, share * command.w, n_left, n_right, self._body)
+        motion = move(self._motion, share * v, share * w, n_left, n_right, self._body)
         if not all(map(math.isfinite, motion[:3])):
             self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")
             return
@@ -142,12 +152,29 @@ class PlantNode(LoopNode[PlantParameters]):
         if self.k % self._steps_per_line == 0:
             self.get_logger().info(progress_line(self.k, self.steps))
 
+    def _plan_of(self, command: Command) -> tuple[tuple[float, float], ...]:
+        """The plan that came with a command, which is its first step; those before it are forgotten."""
+        self._plans = {ns: plan for ns, plan in self._plans.items() if ns >= command.stamp_ns}
+        return self._plans.get(command.stamp_ns, ((command.v, command.w),))
+
+    def _on_plan(self, data: bytes) -> None:
+        try:
+            plan = decode_speeds(data)
+        except InvalidMessageError:
+            self._answer(self._join.reject(stamp_of(data)))
+            raise
+        self._plans[plan.stamp_ns] = plan.speeds
+        self._take(Command(plan.stamp_ns, *plan.speeds[0]))
+
     def _on_command(self, data: bytes) -> None:
         try:
             command = decode_command(data)
         except InvalidMessageError:
             self._answer(self._join.reject(stamp_of(data)))
             raise
+        self._take(command)
+
+    def _take(self, command: Command) -> None:
         if self._lockstep:
             self._answer(self._join.add_message(command))
         else:

@@ -7,6 +7,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from sensor_msgs.msg import TimeReference
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_plant.channels.placed import NOWHERE
 from agv_plant.parameters import RelayParameters
@@ -30,10 +31,11 @@ class RelayNode(LoopNode[RelayParameters]):
         self._place = NOWHERE
         self._edge_pose = self.output(PoseStamped, "edge/pose")
         self._edge_slot = self.output(TimeReference, "edge/slot")
-        self._agv_cmd_vel = self.output(TwistStamped, "agv/cmd_vel")
+        kind, command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
+        self._agv_cmd_vel = self.output(kind, f"agv/{command}")
         self._agv_slot = self.output(TimeReference, "agv/slot")
         self.input(PoseStamped, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot)
-        self.input(TwistStamped, "edge/cmd_vel", self._on_command, self._agv_cmd_vel, self._agv_slot)
+        self.input(kind, f"edge/{command}", self._on_command, self._agv_cmd_vel, self._agv_slot)
 
     def _on_pose(self, data: bytes) -> None:
         if self._needs_place:
@@ -65,6 +67,7 @@ def _counts(name: str, link: Link) -> dict[str, str]:
         f"{name} longest outage": str(link.longest),
         f"{name} delayed": str(link.delayed),
         f"{name} duplicated": str(link.copies),
+        f"{name} expired": str(link.expired),
     }
 
 

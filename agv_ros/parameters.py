@@ -231,6 +231,12 @@ class LoopParameters:
         low=0.0,
         high=60.0,
     )
+    plan_steps: int = parameter(
+        0,
+        "how many commands the controller sends ahead with each one, on edge/plan, the same on all nodes; 0: none",
+        low=0,
+        high=1000,
+    )
     frame_prefix: str = parameter(
         "",
         "what the frames base_link and reference begin with, in messages and on /tf, as robot_state_publisher has it: "
@@ -238,4 +244,4 @@ class LoopParameters:
     )
 
 
-SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "frame_prefix")
+SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_steps", "frame_prefix")

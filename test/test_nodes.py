@@ -20,6 +20,7 @@ from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import TimeReference
+from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
@@ -29,6 +30,7 @@ from agv_plant.unicycle import arc_step
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS, LoopNode
+from agv_ros.speeds_wire import SpeedsAhead, encode_speeds
 
 if TYPE_CHECKING:
     from test.conftest import Start
@@ -196,6 +198,10 @@ def test_qos_can_be_overridden(bench: Bench) -> None:
     bench.until(lambda: bench.probe.count_publishers("edge/cmd_vel") == 1)
     info = bench.probe.get_publishers_info_by_topic("edge/cmd_vel")[0]
     assert info.qos_profile.reliability.short_key == "best_effort"
+    bench.add(RelayNode)
+    bench.until(lambda: bench.probe.count_publishers("edge/pose") == 1)  # another topic of the same process
+    info = bench.probe.get_publishers_info_by_topic("edge/pose")[0]
+    assert info.qos_profile.reliability.short_key == "reliable"
 
 
 # -- messages ---------------------------------------------------------------------------------------------------------
@@ -470,6 +476,34 @@ def test_in_real_time_the_agv_stops_without_commands_and_goes_on_when_they_retur
     bench.until(lambda: plant.state.x > stopped_at)
     assert int(float(plant.facts()["missed deadlines"])) >= 0
     assert float(plant.facts()["jitter max"]) >= float(plant.facts()["jitter p50"]) >= 0.0
+
+
+def test_in_real_time_the_agv_plays_its_plan_and_then_stands_still(bench: Bench) -> None:
+    plant = bench.add(
+        PlantNode, clock="realtime", ts=0.01, cmd_vel_timeout=10.0, duration=math.inf, initial_pose=[0.0, 0.0, 0.0],
+        plan_steps=19, downlink_policy="buffer",
+    )  # fmt: skip
+    plans = bench.publisher(MultiDOFJointTrajectory, "agv/plan")
+    bench.until(lambda: plant.k > 20)
+
+    def is_driving() -> bool:
+        """On a busy machine a plan may be over before it is heard: then another one."""
+        plan = SpeedsAhead(plant.grid.stamp(plant.k), tuple((1.0 + step, 0.0) for step in range(20)))
+        plans.publish(encode_speeds(plan, plant.grid.ts_ns, "base_link"))
+        return bool(plant.state.x > 0.0)
+
+    bench.until(is_driving)
+
+    def stands() -> bool:
+        """Is the newest plan over, and with it the AGV's motion?"""
+        x, k = plant.state.x, plant.k
+        bench.until(lambda: plant.k > k + 30)
+        return bool(plant.state.x == x)
+
+    bench.until(stands)
+    x, k = plant.state.x, plant.k
+    bench.until(lambda: plant.k > k + 30)
+    assert plant.state.x == x > 0.0
 
 
 # -- processes --------------------------------------------------------------------------------------------------------

@@ -114,7 +114,10 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
     return st.sampled_from(found.choices) if found.choices else st.text()
 
 
-ALONE = {"track", "wait_for_subscribers", "stop_timeout", "frame_prefix"}
+ALONE = {
+    "track", "wait_for_subscribers", "stop_timeout", "frame_prefix", "plan_steps", "downlink_policy",
+    *(f"{link}.{name}" for link in ("uplink", "downlink") for name in ("schedule", "hole_circles", "hole_polygons")),
+}  # fmt: skip
 """What a file may not set for one node without setting something else."""
 
 
@@ -129,6 +132,8 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     for link in ("uplink", "downlink"):
         if lines["relay"].get(f"{link}.model") == "trace":
             lines["relay"][f"{link}.trace_file"] = "outages.csv"  # a trace needs one
+        if lines["relay"].get(f"{link}.model") == "coverage_hole":
+            lines["relay"][f"{link}.hole_circles"] = (0.0, 0.0, 1.0)
     nodes = {node: _build(schema, lines[node]) for node, schema in SCHEMAS.items()}
     return Scenario(**nodes)
 

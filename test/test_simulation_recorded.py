@@ -49,6 +49,8 @@ RUNS = {
     "out of order": (
         *LOSSY, "relay.uplink.delay=0.02", "relay.uplink.jitter=0.03", "relay.uplink.duplicate=0.3",
         "relay.downlink.jitter=0.02", "relay.downlink.duplicate=0.2", "controller.kx=5.0",
+        "relay.uplink.lifetime=0.03", "relay.downlink.lifetime=0.01", "relay.downlink.model=coverage_hole",
+        "relay.downlink.hole_circles=[0.0, 1.0, 0.7]",
     ),
     "out of order, predicted": (
         *LOSSY, "relay.uplink.delay=0.02", "relay.uplink.jitter=0.03", "relay.downlink.delay=0.012",
@@ -58,6 +60,18 @@ RUNS = {
         "relay.uplink.model=gilbert_elliott", "relay.uplink.r=0.3",
         "relay.uplink.schedule=0.5: p=0.1; 1: outage=0.05 every 0.4; 2: p=0; 2: delay=0.01; 2.5: outage=0",
         "relay.downlink.schedule=1.2: outage=0.1",
+    ),
+    "plays a plan in outages": (
+        *LOSSY, "relay.downlink.model=burst", "relay.downlink.n=9", "plant.downlink_policy=buffer",
+        "plant.plan_steps=7", "plant.integration=arc", "controller.integration=arc",
+    ),
+    "plans come late, and twice": (
+        "relay.downlink.delay=0.012", "relay.downlink.jitter=0.008", "relay.downlink.duplicate=0.2", *LOSSY,
+        "plant.downlink_policy=buffer", "plant.plan_steps=5",
+    ),
+    "predicts and plans": (
+        *LOSSY, "relay.downlink.model=bernoulli", "relay.downlink.p=0.5", "plant.downlink_policy=buffer",
+        "plant.plan_steps=3", "error_detector.policy=predict", "controller.v_max=3.0", "plant.speed_scale=1.05",
     ),
     "a heavy AGV": (*LOSSY, "plant.a_max=3.0", "plant.lag=0.02", "plant.w_max=1.5", "error_detector.track=eight"),
     "smooth, in parts": (*LOSSY, "plant.j_max=400.0", "plant.a_max=20.0", "plant.substeps=5", "plant.lag=0.01"),
@@ -102,8 +116,9 @@ def test_every_channel_policy_and_limit(
     turn = list(CHANNELS.values()).index(channel) + POLICIES.index(policy)
     downlink = DOWNLINK_POLICIES[turn % len(DOWNLINK_POLICIES)]
     settings = (*files, f"error_detector.track={TRACKS[turn % len(TRACKS)]}", f"plant.downlink_policy={downlink}")
+    planned = ("plant.plan_steps=2",) if downlink == "buffer" else ()
     lossy = ("relay.downlink.model=bernoulli", "relay.downlink.p=0.2", "plant.initial_pose=[0.3, -0.2, 1.3]")
-    agree(drive(*settings, *lossy, *channel, limit, f"error_detector.policy={policy}", "plant.duration=1.5"))
+    agree(drive(*settings, *planned, *lossy, *channel, limit, f"error_detector.policy={policy}", "plant.duration=1.5"))
 
 
 @pytest.mark.parametrize("track", TRACKS)

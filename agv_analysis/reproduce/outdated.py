@@ -62,7 +62,7 @@ def drive(reference: Rows, start: Loop, settings: Settings, n: int, rows: NDArra
         x_then, y_then, theta_then, _, _ = reference[then]
         held = received(loop, x, y, theta, x_then, y_then, theta_then, k - then)
         sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
-        loop = obey(held, sent, False, 0.0, 0.0, settings)
+        loop = obey(held, sent, False, 0.0, 0.0, v_r, w_r, settings)
         if not goes_on(loop, sent):
             return k + 1
     return len(reference)

@@ -29,6 +29,9 @@ OUTAGES = {
 SCALES = (1.0, 1.1)
 """True over commanded speed: the predictor's model is exact, or 10 % wrong."""
 
+PLANNED = 20
+"""Commands that the downlink policy `buffer` has ahead."""
+
 ERROR = "farthest from the reference [m]"
 PART = "twins part"
 
@@ -45,7 +48,7 @@ def edge() -> Iterator[Values]:
 def downlink() -> Iterator[Values]:
     """By outages on the downlink: each downlink policy, the best first."""
     for name, outages in OUTAGES.items():
-        kept = (ON_TRACK, *(f"relay.downlink.{setting}" for setting in outages))
+        kept = (ON_TRACK, f"plant.plan_steps={PLANNED}", *(f"relay.downlink.{setting}" for setting in outages))
         yield from ({"downlink": name, **row} for row in _ranked("plant.downlink_policy", DOWNLINK_POLICIES, kept))
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.convergence import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.plan import next_error
 from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import share_of_command
@@ -43,7 +44,9 @@ class Settings(NamedTuple):
     model_arc: bool
     """The same as `arc`, for the edge's model of the plant."""
     downlink_policy: int
-    ramp_steps: float
+    policy_steps: float
+    plan_arc: bool | None
+    """The same as `arc`, for the controller's model, if the plant plays its plans."""
     body: Body | None
     """The AGV, if it is not the paper's, which does what it is told."""
     noise_xy: float
@@ -76,6 +79,10 @@ class Loop(NamedTuple):
     w_driven: float
     a_driven: float
     """Its acceleration in that period."""
+    x_ahead: float
+    """The tracking error that the plan which the plant holds expects of the next step."""
+    y_ahead: float
+    theta_ahead: float
 
 
 class Answer(NamedTuple):
@@ -103,7 +110,7 @@ class Case(NamedTuple):
 
 def at_rest(x: float, y: float, theta: float) -> Loop:
     """The loop before slot 0 with the AGV at a pose in frame `map` [m, m, rad]."""
-    return Loop(x, y, theta, x, y, theta, math.nan, math.nan, math.nan, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0)
+    return Loop(x, y, theta, x, y, theta, math.nan, math.nan, math.nan, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 # -- one slot ----------------------------------------------------------------------------------------------------------
@@ -117,12 +124,12 @@ def slot(
     if case.lost[k]:
         held = outdated(loop)
         sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-        return obey(held, sent, case.downlink_lost[k], n_left, n_right, case.settings), sent
+        return obey(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
     x, y, theta = sent_pose(loop, case.noise, k, case.settings)
     held = received(loop, x, y, theta, x_r, y_r, theta_r, 0)
     sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-    return obey(held, sent, case.downlink_lost[k], n_left, n_right, case.settings), sent
+    return obey(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
 
 
 def sent_pose(loop: Loop, noise: Rows | None, k: int, settings: Settings) -> tuple[float, float, float]:
@@ -145,7 +152,7 @@ def outdated(loop: Loop) -> Loop:
     return Loop(
         loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
         loop.theta_then, loop.n_ul + 1, loop.v, loop.w, loop.n_dl, loop.v_driven, loop.w_driven,
-        loop.a_driven,
+        loop.a_driven, loop.x_ahead, loop.y_ahead, loop.theta_ahead,
     )  # fmt: skip
 
 
@@ -155,7 +162,7 @@ def received(
     """The edge holds a pose that was taken n_ul steps ago, when the reference was at (x_then, y_then, theta_then)."""
     return Loop(
         loop.x, loop.y, loop.theta, x, y, theta, x_then, y_then, theta_then, n_ul, loop.v, loop.w, loop.n_dl,
-        loop.v_driven, loop.w_driven, loop.a_driven,
+        loop.v_driven, loop.w_driven, loop.a_driven, loop.x_ahead, loop.y_ahead, loop.theta_ahead,
     )  # fmt: skip
 
 
@@ -163,7 +170,17 @@ def commanded(loop: Loop, v: float, w: float, n_dl: int) -> Loop:
     """The plant holds a command that was sent n_dl steps ago [m/s, rad/s]."""
     return Loop(
         loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
-        loop.theta_then, loop.n_ul, v, w, n_dl, loop.v_driven, loop.w_driven, loop.a_driven,
+        loop.theta_then, loop.n_ul, v, w, n_dl, loop.v_driven, loop.w_driven, loop.a_driven, loop.x_ahead, loop.y_ahead,
+        loop.theta_ahead,
+    )  # fmt: skip
+
+
+def expecting(loop: Loop, x_ahead: float, y_ahead: float, theta_ahead: float) -> Loop:
+    """The plan that the plant holds expects this error of the next step."""
+    return Loop(
+        loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
+        loop.theta_then, loop.n_ul, loop.v, loop.w, loop.n_dl, loop.v_driven, loop.w_driven, loop.a_driven, x_ahead,
+        y_ahead, theta_ahead,
     )  # fmt: skip
 
 
@@ -181,16 +198,19 @@ def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: 
     return Answer(x_e, y_e, theta_e, limit_speed(v, settings.v_max), w)
 
 
-def obey(loop: Loop, sent: Answer, lost: bool, n_left: float, n_right: float, settings: Settings) -> Loop:
+def obey(
+    loop: Loop, sent: Answer, lost: bool, n_left: float, n_right: float, v_r: float, w_r: float, settings: Settings
+) -> Loop:
     """One sampling period of the plant under the freshest command, and of the edge's model under the one it sent.
 
-    n_left and n_right are the wheels' normal numbers. A command beyond the range of numbers is refused by the plant,
-    which goes on with the one before.
+    n_left and n_right are the wheels' normal numbers, v_r and w_r the reference's speeds, as a plan knows them. A
+    command beyond the range of numbers is refused by the plant, which goes on with the one before.
     """
     v, w, n_dl = sent.v, sent.w, 0
     if lost or not are_finite(v, w, 0.0):
         v, w, n_dl = loop.v, loop.w, loop.n_dl + 1
-    moved = period(loop, v, w, n_dl, n_left, n_right, settings.body, settings)
+    plan = played(loop, sent, v, w, n_dl, v_r, w_r, settings.plan_arc, settings)
+    moved = period(loop, plan.v, plan.w, n_dl, n_left, n_right, settings.body, settings)
     x_held, y_held, theta_held = loop.x_held, loop.y_held, loop.theta_held
     if settings.policy == PREDICT and are_finite(sent.v, sent.w, 0.0):
         x_held, y_held, theta_held = plant_step(
@@ -198,8 +218,24 @@ def obey(loop: Loop, sent: Answer, lost: bool, n_left: float, n_right: float, se
         )
     return Loop(
         moved.x, moved.y, moved.theta, x_held, y_held, theta_held, loop.x_then, loop.y_then, loop.theta_then, loop.n_ul,
-        v, w, n_dl, moved.v, moved.w, moved.a,
+        v, w, n_dl, moved.v, moved.w, moved.a, plan.x_e, plan.y_e, plan.theta_e,
     )  # fmt: skip
+
+
+def played(
+    loop: Loop, sent: Answer, v: float, w: float, n_dl: int, v_r: float, w_r: float, plan_arc: bool | None,
+    settings: Settings,
+) -> Answer:  # fmt: skip
+    """What the plant drives, n_dl steps after (v, w) was sent, and the error that its plan expects of the next step."""
+    if plan_arc is None:
+        return Answer(loop.x_ahead, loop.y_ahead, loop.theta_ahead, v, w)
+    x_e, y_e, theta_e = sent.x_e, sent.y_e, sent.theta_e
+    if n_dl > 0:
+        x_e, y_e, theta_e = loop.x_ahead, loop.y_ahead, loop.theta_ahead
+        v, w = control_law(x_e, y_e, theta_e, v_r, w_r, settings.kx, settings.ky, settings.ktheta)
+        v = limit_speed(v, settings.v_max)
+    x_e, y_e, theta_e = next_error(x_e, y_e, theta_e, v, w, v_r, w_r, settings.ts, plan_arc)
+    return Answer(x_e, y_e, theta_e, v, w)
 
 
 def period(
@@ -209,7 +245,7 @@ def period(
     if body is None:
         x, y, theta = plant_step(settings.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
         return Motion(x, y, theta, v, w, 0.0)
-    share = share_of_command(n_dl, settings.downlink_policy, settings.ramp_steps)
+    share = share_of_command(n_dl, settings.downlink_policy, settings.policy_steps)
     before = Motion(loop.x, loop.y, loop.theta, loop.v_driven, loop.w_driven, loop.a_driven)
     return move(before, share * v, share * w, n_left, n_right, body)
 

@@ -28,9 +28,11 @@ from agv_analysis.simulation.loop import (
     begin,
     commanded,
     end,
+    expecting,
     goes_on,
     obey,
     outdated,
+    played,
     received,
     seen,
     sent_pose,
@@ -107,20 +109,41 @@ def slot_on_air(
 ) -> tuple[Loop, Answer]:
     """From one pose to the next, with the pose of step `taken` at the edge, the command of step `ordered` at the AGV.
 
-    `past` has the poses that were sent and the commands, (x, y, theta, v, w) in a row, up to the pose of step k; the
-    command of step k is written into it.
+    `past` has the poses that were sent, the commands, and the errors that they answer, (x, y, theta, v, w, x_e, y_e,
+    theta_e) in a row, up to the pose of step k; command and error of step k are written into it.
     """
     x_r, y_r, theta_r, v_r, w_r = reference[k]
     held = at_the_edge(loop, k, taken, reference, past, case.settings)
     sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
     past[k, 3], past[k, 4] = sent.v, sent.w
+    past[k, 5], past[k, 6], past[k, 7] = sent.x_e, sent.y_e, sent.theta_e
     n_left, n_right = wheels(case.slip, k)
     if ordered == k:
-        return obey(held, sent, False, n_left, n_right, case.settings), sent
+        return obey(held, sent, False, n_left, n_right, v_r, w_r, case.settings), sent
     v, w = past[ordered, 3], past[ordered, 4]
     if are_finite(v, w, 0.0):  # else the plant has refused it, and goes on with the one before
+        is_news = ordered != k - 1 - loop.n_dl
         held = commanded(held, v, w, k - 1 - ordered)
-    return obey(held, sent, True, n_left, n_right, case.settings), sent
+        if is_news:
+            held = planned(held, ordered, k, reference, past, case.settings.plan_arc, case.settings)
+    return obey(held, sent, True, n_left, n_right, v_r, w_r, case.settings), sent
+
+
+def planned(
+    loop: Loop, ordered: int, k: int, reference: Rows, past: NDArray[np.float64], plan_arc: bool | None,
+    settings: Settings,
+) -> Loop:  # fmt: skip
+    """The plant holds the plan of step `ordered`, and has come to its step k."""
+    if plan_arc is None:
+        return loop
+    sent = Answer(past[ordered, 5], past[ordered, 6], past[ordered, 7], past[ordered, 3], past[ordered, 4])
+    x, y, theta = loop.x_ahead, loop.y_ahead, loop.theta_ahead
+    for step in range(ordered, k):
+        _, _, _, v_r, w_r = reference[step]
+        at_step = expecting(loop, x, y, theta)
+        plan = played(at_step, sent, sent.v, sent.w, step - ordered, v_r, w_r, plan_arc, settings)
+        x, y, theta = plan.x_e, plan.y_e, plan.theta_e
+    return expecting(loop, x, y, theta)
 
 
 def at_the_edge(loop: Loop, k: int, taken: int, reference: Rows, past: NDArray[np.float64], settings: Settings) -> Loop:
@@ -146,7 +169,7 @@ def history_on_air(
 
     `reference` has shape (N, 5); the verdicts of `case` mean nothing. Returns the number of slots until the run ended.
     """
-    loop, past = case.start, np.empty((len(rows), 5))
+    loop, past = case.start, np.empty((len(rows), 8))
     for k in range(len(rows)):
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
         past[k, 0], past[k, 1], past[k, 2] = sent_pose(loop, case.noise, k, case.settings)
@@ -164,7 +187,7 @@ def statistics_on_air(
     reference: Rows, case: Case, up: Way, down: Way, up_marks: Marks, down_marks: Marks
 ) -> Statistics:
     """One run of which only the metrics are kept, and the marks."""
-    run, past = begin(reference, case), np.empty((len(up_marks.held), 5))
+    run, past = begin(reference, case), np.empty((len(up_marks.held), 8))
     for k in range(len(past)):
         past[k, 0], past[k, 1], past[k, 2] = sent_pose(run.loop, case.noise, k, case.settings)
         taken = transmit(up, up_marks, k, past[k, 0], past[k, 1])
@@ -189,7 +212,7 @@ def contraction_on_air(reference: Rows, case: Case, twin: Loop, up_marks: Marks,
     Both meet what was marked when the run was made: the twin loses what the run lost, wherever it is.
     """
     one, other = case.start, twin
-    past, past_of_twin = np.empty((len(up_marks.held), 5)), np.empty((len(up_marks.held), 5))
+    past, past_of_twin = np.empty((len(up_marks.held), 8)), np.empty((len(up_marks.held), 8))
     for k in range(len(past)):
         past[k, 0], past[k, 1], past[k, 2] = sent_pose(one, case.noise, k, case.settings)
         past_of_twin[k, 0], past_of_twin[k, 1], past_of_twin[k, 2] = sent_pose(other, case.noise, k, case.settings)

@@ -118,7 +118,8 @@ def settings_of(scenario: Scenario) -> Settings:
         policy=POLICIES.index(edge.policy),
         model_arc=edge.integration == "arc",
         downlink_policy=DOWNLINK_POLICIES.index(plant.downlink_policy),
-        ramp_steps=plant.ramp_time / plant.ts,
+        policy_steps=plant.policy_steps,
+        plan_arc=gains.integration == "arc" if plant.downlink_policy == "buffer" else None,
         body=None if is_paper else body,
         noise_xy=plant.noise_xy, noise_theta=plant.noise_theta,
     )  # fmt: skip

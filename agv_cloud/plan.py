@@ -1,0 +1,48 @@
+"""The controller's plan: the commands of the next steps, sent ahead with that of now.
+
+If the downlink loses the command of a step, the AGV goes on with the newest plan that it holds: packetised predictive
+control. The plan is what the controller would command if the AGV moved as its model says. Everything is seen from the
+AGV, so the controller needs nothing but the tracking error and the speeds of the reference. With an exact model and an
+uplink that loses nothing, outages of the downlink that are no longer than the plan do not change the loop.
+
+Source: Bemporad, Predictive control of teleoperated constrained systems with unbounded communication delays, CDC 1998;
+Quevedo and Nesic, Input-to-state stability of packetized predictive control over unreliable networks, IEEE TAC 2011.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.tracking_error import tracking_error
+from agv_plant.motion import plant_step
+from agv_plant.unicycle import euler_step
+
+
+def next_error(
+    x_e: float, y_e: float, theta_e: float, v: float, w: float, v_r: float, w_r: float, ts: float, arc: bool
+) -> tuple[float, float, float]:
+    """eps(k+1) [m, m, rad] if AGV and reference begin at eps(k) and move on at (v, w) and (v_r, w_r) [m/s, rad/s].
+
+    The AGV along the arc or by Euler's step, the reference by the latter, as it is defined.
+    """
+    x, y, theta = plant_step(arc, 0.0, 0.0, 0.0, v, w, ts)
+    x_r, y_r, theta_r = euler_step(x_e, y_e, theta_e, v_r, w_r, ts)
+    return tracking_error(x_r, y_r, theta_r, x, y, theta)
+
+
+def planned_commands(
+    error: tuple[float, float, float],
+    speeds: Iterable[tuple[float, float]],
+    gains: tuple[float, float, float],
+    v_max: float,
+    ts: float,
+    arc: bool,
+) -> list[tuple[float, float]]:
+    """Commands (v, w) from now on, one for each of the reference's `speeds` (v_r, w_r), the first for `error`."""
+    commands = []
+    for v_r, w_r in speeds:
+        v, w = control_law(*error, v_r, w_r, *gains)
+        commands.append((limit_speed(v, v_max), w))
+        error = next_error(*error, *commands[-1], v_r, w_r, ts, arc)
+    return commands
