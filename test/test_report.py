@@ -281,6 +281,18 @@ def test_the_sentence_says_how_it_is(lap: Analysis) -> None:
     assert sentence(calm) == "The AGV keeps to its track; no update was lost."
 
 
+@pytest.mark.parametrize(
+    ("delay", "expected"),
+    [
+        (0.06, "The AGV keeps to its track with poses up to 12 steps (60 ms) old."),
+        (0.065, "The AGV does not keep to its track: poses up to 13 steps (65 ms) old are too much for these gains."),
+    ],
+)
+def test_old_poses_are_no_outages(delay: float, expected: str) -> None:
+    late = ("error_detector.track=line", f"relay.uplink.delay={delay}", "plant.duration=10.0")
+    assert sentence(analyse(simulate(scenario_of(*late, config="paper")))) == expected
+
+
 def test_eigenvalues_that_are_drawn_are_those_that_were_judged(lap: Analysis) -> None:
     assert np.abs(lifted_multipliers(lap)).max() == pytest.approx(lap.lifted_radius, rel=1e-9)
     assert np.abs(paper_eigenvalues(lap.run)).max() <= lap.paper.radius * (1.0 + 1e-9)
