@@ -168,6 +168,10 @@ class ChannelParameters:
     duplicate: float = parameter(
         0.0, "probability that a message comes a second time, with a delay of its own", low=0.0, high=1.0, runtime=True
     )
+    lifetime: float = parameter(
+        math.inf, "a message that would come older than this never comes, .inf: all come", unit="s", above=0.0,
+        high=math.inf, runtime=True,
+    )  # fmt: skip
     schedule: str = parameter(
         "",
         "what changes in a run, as in '20: p=0.1; 20: outage=0.3 every 5; 60: outage=0': from 20 s on p is 0.1 and all "

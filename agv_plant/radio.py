@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_plant.channels import GOOD
-from agv_plant.channels.delay import delays_of, whole_slots
+from agv_plant.channels.delay import EXPIRED, delays_of, whole_slots
 from agv_plant.channels.installed import TRACE, ChannelError, find_model
 from agv_plant.channels.placed import NOWHERE, UPLINK, floor_of, kind_of, levels_of, verdict_at
 from agv_plant.channels.schedule import OUTAGE, Segment, is_scripted, segments_of
@@ -49,7 +49,7 @@ class Verdict(NamedTuple):
 
     lost: bool
     cause: str = ""
-    """The channel's model, or `outage` if the schedule says so; empty if the message is not lost."""
+    """The channel's model, `outage` if the schedule says so, or `expired`; empty if the message is not lost."""
     state: int = GOOD
     """The state that decided, of a channel with memory."""
     gain: float = math.nan
@@ -104,6 +104,7 @@ class Channel:
         self._parameters = parameters
         self._segments = segments_of(parameters, self._ts)
         self._firsts = [segment.first for segment in self._segments]
+        self._may_expire = any(segment.channel.lifetime < math.inf for segment in self._segments)
         self._has_outages = any(segment.outage.length > 0.0 for segment in self._segments)
 
     def lost(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> bool:
@@ -117,15 +118,17 @@ class Channel:
             return verdict._replace(lost=False, cause="")
         if self._has_outages and is_scripted(k, *self._segment(k).outage, self._ts):
             return verdict._replace(lost=True, cause=OUTAGE)
+        if self._may_expire and max(self.delays(k)) < 0.0:
+            return verdict._replace(lost=True, cause=EXPIRED)
         return verdict
 
     def delays(self, k: int) -> tuple[float, float]:
-        """Slots that the message of slot `k` is under way if it is not lost, and its copy, -1 if there is none."""
+        """Slots that the message of slot `k` is under way if it is not lost, and its copy; -1 for what never comes."""
         c = self._segment(k).channel
         if c.delay + c.jitter + c.duplicate == 0.0:
             return 0.0, -1.0
         u_delay, u_twice, u_copy, _ = self._random_delays.at(k)
-        return delays_of(k, u_delay, u_twice, u_copy, c.delay, c.jitter, c.duplicate, self._ts)
+        return delays_of(k, u_delay, u_twice, u_copy, c.delay, c.jitter, c.duplicate, c.lifetime, self._ts)
 
     def _segment(self, k: int) -> Segment:
         if len(self._segments) == 1:
@@ -205,6 +208,8 @@ class Link:
         """Messages that came, or will come, in a later slot than their own."""
         self.copies = 0
         """Messages that came, or will come, a second time."""
+        self.expired = 0
+        """Messages of those lost that would have come too old."""
         self._run = 0
 
     def transmit(self, stamp_ns: int, message: bytes = b"", place: tuple[float, float] = NOWHERE) -> Passage:
@@ -239,6 +244,7 @@ class Link:
     def _count(self, verdict: Verdict, wait: int) -> None:
         self.sent += 1
         self.lost += verdict.lost
+        self.expired += verdict.cause == EXPIRED
         self.delayed += wait > 0
         self._run = self._run + 1 if verdict.lost else 0
         self.longest = max(self.longest, self._run)

@@ -67,6 +67,7 @@ def _counts(name: str, link: Link) -> dict[str, str]:
         f"{name} longest outage": str(link.longest),
         f"{name} delayed": str(link.delayed),
         f"{name} duplicated": str(link.copies),
+        f"{name} expired": str(link.expired),
     }
 
 

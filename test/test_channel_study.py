@@ -134,18 +134,45 @@ def test_what_a_line_leaves_out_is_as_in_netem() -> None:
         ("loss gemodel nan", "'nan'"),
         ("loss gemodel", "'loss gemodel'"),
         ("loss state 1%", "'loss state 1%'"),
-        ("delay 10ms", "'10ms'|'delay 10ms'"),
+        ("loss random 1% loss random 2%", "'loss random 1% loss random 2%'"),
+        ("delay 10m", "'10m'"),
+        ("delay 10ms 2ms 25%", "'delay 10ms 2ms 25%'"),
+        ("delay -1ms", "'-1ms'"),
+        ("delay 1.2.3ms", "'1.2.3ms'"),
+        ("duplicate", "'duplicate'"),
+        ("rate 1mbit", "'rate 1mbit'"),
         ("", "''"),
     ],
 )
 def test_a_line_that_netem_would_not_take_is_refused(line: str, found: str) -> None:
-    with pytest.raises(NetemError, match=f"must be loss gemodel .*; got ({found})"):
+    with pytest.raises(NetemError, match=f"must be loss gemodel .*; got {found}"):
         from_netem(line, ChannelParameters())
 
 
 def test_a_model_that_netem_does_not_have_is_refused() -> None:
     with pytest.raises(NetemError, match="netem has no channel burst, only bernoulli and gilbert_elliott"):
         to_netem(ChannelParameters(model="burst", n=3))
+    with pytest.raises(NetemError, match=r"netem has no schedule; the channel's is 1: p=0\.5"):
+        to_netem(ChannelParameters(model="bernoulli", p=0.1, schedule="1: p=0.5"))
+    with pytest.raises(NetemError, match=r"netem has no lifetime; the channel's is 0\.1"):
+        to_netem(ChannelParameters(model="bernoulli", p=0.1, lifetime=0.1))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "delay 20ms", "delay 20ms 5ms", "delay 0ms 5ms", "duplicate 30%", "delay 12.5ms loss random 1% duplicate 0.5%",
+        "delay 3ms 1ms loss gemodel 1% 10% 70% 0.1%",
+    ],
+)  # fmt: skip
+def test_delays_go_in_and_out_unchanged(line: str) -> None:
+    assert to_netem(from_netem(line, ChannelParameters(delay=1.0, duplicate=0.2))) == line
+
+
+def test_times_are_those_of_netem() -> None:
+    for line in ("delay 20ms 5ms", "delay 0.02s 5000us", "delay 20000 5000"):
+        found = from_netem(line, ChannelParameters(model="bernoulli", p=0.3))
+        assert (found.model, found.delay, found.jitter) == ("perfect", 0.02, 0.005)
 
 
 # -- the command -----------------------------------------------------------------------------------------------------

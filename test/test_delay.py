@@ -21,9 +21,9 @@ from agv_analysis.simulation.on_air import Marks, blank, listen
 from agv_analysis.simulation.verdicts import Air
 from agv_analysis.stability.margins import left_out
 from agv_analysis.stability.verdict import ASYMPTOTIC, UNKNOWN, UNSTABLE
-from agv_plant.channels.delay import delay_in_slots, whole_slots
+from agv_plant.channels.delay import EXPIRED, delay_in_slots, whole_slots
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, Link
+from agv_plant.radio import Channel, Link, losses
 from agv_ros.stamps import Grid
 from agv_ros.wire import DELAYED, DELIVERED, LOST, facts_in
 from test.test_links import last_words
@@ -74,7 +74,7 @@ def test_copies_are_as_many_as_asked_for_and_have_delays_of_their_own() -> None:
 late = st.builds(
     ChannelParameters,
     model=st.just("bernoulli"), p=st.floats(0.0, 0.6), delay=st.floats(0.0, 0.05), jitter=st.floats(0.0, 0.05),
-    duplicate=st.floats(0.0, 1.0),
+    duplicate=st.floats(0.0, 1.0), lifetime=st.sampled_from([math.inf, 0.001, 0.02, 0.05]),
 )  # fmt: skip
 
 
@@ -95,6 +95,28 @@ def test_everything_arrives_in_its_slot_and_in_the_order_of_its_instants(c: Chan
             GRID.stamp(k), GRID.stamp(freshest), LOST if channel.lost(k) else DELAYED if wait else DELIVERED
         )  # fmt: skip
         assert facts_in(slot.note).get("delay", "0") == str(wait)
+
+
+def test_what_would_be_too_old_never_comes() -> None:
+    """Up to 20 ms, four slots: of delays uniform from 0 to 40 ms half is lost for that."""
+    c = ChannelParameters(delay=0.02, jitter=0.02, lifetime=0.02)
+    link, steps = Link(Channel(c, 1, "uplink", TS), GRID), 20_000
+    ages, causes = [], []
+    for k in range(steps):
+        slot, arrived = link.transmit(GRID.stamp(k), str(k).encode())
+        ages += [k - int(data) for data in arrived]
+        causes.append(facts_in(slot.note).get("cause", ""))
+    assert set(ages) == set(range(5))
+    assert set(causes) == {"", EXPIRED}
+    assert causes.count(EXPIRED) == link.expired == link.lost
+    assert abs(link.expired / steps - 0.5) < 5.0 * math.sqrt(0.25 / steps)
+
+
+def test_a_copy_may_come_in_time_where_the_message_does_not() -> None:
+    c = ChannelParameters(delay=0.02, jitter=0.02, lifetime=0.02, duplicate=1.0)
+    lost = losses(c, 1, "uplink", 20_000, TS)
+    assert abs(lost.mean() - 0.25) < 5.0 * math.sqrt(0.25 * 0.75 / 20_000)
+    assert np.array_equal(Air(1, 20_000, TS).verdicts(c, "uplink"), lost)
 
 
 def test_a_new_run_hears_nothing_of_what_was_under_way() -> None:

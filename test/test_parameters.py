@@ -81,7 +81,7 @@ def test_every_double_refuses_what_is_no_number_and_what_is_an_integer(found: Pa
     assert refusal(found, 25).endswith("is a double, got the integer 25: write 25.0")
     for value in (True, "25.0", None, [1.0], 1 + 0j):
         assert refusal(found, value).endswith(f"is a double, got {value!r}")
-    if found.name not in ("v_max", "duration", "w_max", "a_max", "j_max"):
+    if found.name not in ("v_max", "duration", "w_max", "a_max", "j_max") and not found.name.endswith(".lifetime"):
         assert "got inf" in refusal(found, math.inf)
     else:
         assert found.check("node", math.inf) == math.inf
@@ -170,6 +170,7 @@ def test_what_can_change_while_running() -> None:
             "delay",
             "jitter",
             "duplicate",
+            "lifetime",
         )
     }
     assert changing == gains | losses

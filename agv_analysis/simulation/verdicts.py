@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections import namedtuple
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +20,7 @@ from agv_analysis.compiled import compiled, numbers
 from agv_analysis.simulation.chance import normals
 from agv_analysis.simulation.on_air import Way
 from agv_plant.channels import GOOD, MODELS
-from agv_plant.channels.delay import delays_of, soonest
+from agv_plant.channels.delay import NEVER, delays_of, soonest
 from agv_plant.channels.installed import TRACE, find_model
 from agv_plant.channels.placed import floor_of, kind_of, levels_of
 from agv_plant.channels.schedule import Segment, is_scripted, segments_of
@@ -76,6 +77,8 @@ class Air:
         for segment, end in _segments(channel, self._steps, self._ts):
             if segment.outage.length > 0.0:
                 compiled(_script)(lost, segment.first, end, *segment.outage, self._ts)
+            if segment.channel.lifetime < math.inf:
+                lost[segment.first : end] |= _slots_under_way(segment, end, self._seed, stream, self._ts) == NEVER
         lost[0] = False  # slot 0 never is
         return lost
 
@@ -102,12 +105,19 @@ def way_of(
         now = segment.channel
         levels[segment.first : end] = levels_of(now)
         if now.delay + now.jitter > 0.0:
-            delays = numbers(delay_draws(seed, stream, segment.first, end - segment.first))
-            waits[segment.first : end] = compiled(_waits)(
-                delays, segment.first, now.delay, now.jitter, now.duplicate, ts
-            )
+            waits[segment.first : end] = _slots_under_way(segment, end, seed, stream, ts)
+    waits[waits == NEVER] = 0  # lost, as said
     floor = np.array(floor_of(channel, seed, stream) if channel.is_placed else [], dtype=np.float64).reshape(-1, 5)
     return Way(numbers(lost), kind_of(channel.model), numbers(floor), numbers(levels), numbers(random), numbers(waits))
+
+
+def _slots_under_way(segment: Segment, end: int, seed: int, stream: str, ts: float) -> NDArray[np.int64]:
+    """Slots until the messages of a segment's slots arrive, or the first of their copies, NEVER if none does."""
+    random, now = delay_draws(seed, stream, segment.first, end - segment.first), segment.channel
+    found: NDArray[np.int64] = compiled(_waits)(
+        numbers(random), segment.first, now.delay, now.jitter, now.duplicate, now.lifetime, ts
+    )
+    return found
 
 
 def _segments(channel: ChannelParameters, steps: int, ts: float) -> list[tuple[Segment, int]]:
@@ -133,10 +143,12 @@ def _script(lost: Verdicts, first: int, end: int, at: float, length: float, peri
         lost[k] = lost[k] or is_scripted(k, at, length, period, ts)
 
 
-def _waits(random: Any, first: int, delay: float, jitter: float, duplicate: float, ts: float) -> NDArray[np.int64]:
+def _waits(
+    random: Any, first: int, delay: float, jitter: float, duplicate: float, lifetime: float, ts: float
+) -> NDArray[np.int64]:
     waits = np.empty(len(random), dtype=np.int64)
     for i in range(len(random)):
         u_delay, u_twice, u_copy, _ = random[i]
-        message, copy = delays_of(first + i, u_delay, u_twice, u_copy, delay, jitter, duplicate, ts)
+        message, copy = delays_of(first + i, u_delay, u_twice, u_copy, delay, jitter, duplicate, lifetime, ts)
         waits[i] = soonest(message, copy)
     return waits

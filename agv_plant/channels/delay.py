@@ -11,7 +11,10 @@ from __future__ import annotations
 import math
 
 NEVER = -1
-"""In place of a slot of arrival: there is no copy."""
+"""In place of a time under way: there is no copy, or it expires before it comes."""
+
+EXPIRED = "expired"
+"""Cause of a loss: the message would have come, but older than its lifetime."""
 
 _ROUNDING = 1e-9
 """Slots by which a delay may exceed whole ones: 0.015 s are more than three slots of 0.005 s to a computer."""
@@ -28,19 +31,29 @@ def whole_slots(slots: float) -> int:
 
 
 def delays_of(
-    k: int, u_delay: float, u_twice: float, u_copy: float, delay: float, jitter: float, duplicate: float, ts: float
-) -> tuple[float, float]:
+    k: int, u_delay: float, u_twice: float, u_copy: float, delay: float, jitter: float, duplicate: float,
+    lifetime: float, ts: float,
+) -> tuple[float, float]:  # fmt: skip
     """Times under way [slots] of the message of slot k and of its copy, NEVER if there is none.
 
-    There is one with probability `duplicate`. The message of slot 0 arrives at once and alone: a run begins with the
-    AGV known to the edge.
+    There is one with probability `duplicate`. What would be older than `lifetime` [s] in its slot of arrival never
+    comes. The message of slot 0 arrives at once and alone: a run begins with the AGV known to the edge.
     """
     if k == 0:
         return 0.0, float(NEVER)
-    first = delay_in_slots(u_delay, delay, jitter, ts)
-    return first, delay_in_slots(u_copy, delay, jitter, ts) if u_twice < duplicate else float(NEVER)
+    first = in_time(delay_in_slots(u_delay, delay, jitter, ts), lifetime, ts)
+    if u_twice >= duplicate:
+        return first, float(NEVER)
+    return first, in_time(delay_in_slots(u_copy, delay, jitter, ts), lifetime, ts)
+
+
+def in_time(slots: float, lifetime: float, ts: float) -> float:
+    """`slots` under way, or NEVER if that is longer than a lifetime [s]."""
+    return slots if whole_slots(slots) <= lifetime / ts + _ROUNDING else float(NEVER)
 
 
 def soonest(first: float, copy: float) -> int:
-    """Whole slots until the receiver has the message or its copy, whichever comes first."""
-    return whole_slots(first if copy < 0.0 else min(first, copy))
+    """Whole slots until the receiver has the message or its copy, whichever comes first; NEVER if neither does."""
+    if first < 0.0 or copy < 0.0:
+        return whole_slots(max(first, copy))
+    return whole_slots(min(first, copy))
