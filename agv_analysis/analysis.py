@@ -9,7 +9,7 @@ import numpy as np
 
 from agv_analysis.channel_fit import ChannelFit, fit_channel
 from agv_analysis.convergence import Convergence, convergence
-from agv_analysis.outages import Outages, outages
+from agv_analysis.outages import Outages, loss_causes, outages
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
@@ -80,7 +80,9 @@ class Observations:
             "n_ul_p99": up.age.p99,
             "mean_burst": up.mean_burst,
             "outage_lengths": {str(length): count for length, count in up.histogram.items()},
+            "loss_causes": loss_causes(run.uplink),
             "downlink_loss_rate": down.loss_rate,
+            "downlink_loss_causes": loss_causes(run.downlink),
             "settle_1cm_steps": self.convergence.settle_1cm_steps,
             "settle_2pct_steps": self.convergence.settle_2pct_steps,
             "overshoot": self.convergence.overshoot,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.run import Run
+from agv_analysis.run import LinkSlots, Run
 from agv_ros.errors import UserError
 
 Steps = NDArray[np.int64]
@@ -98,6 +98,15 @@ def outages(run: Run) -> Outages:
         uplink=link_outages(run.k, run.lost, run.n_ul, run.ts),
         downlink=link_outages(run.k, run.downlink_lost, n_dl, run.ts),
     )
+
+
+def loss_causes(link: LinkSlots | None) -> dict[str, int]:
+    """Lost slots of a link by what lost them, the most frequent first; empty where no slot says why."""
+    if link is None:
+        return {}
+    causes, counts = np.unique(link.cause[link.cause != ""], return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    return dict(zip(causes[order].tolist(), counts[order].tolist(), strict=True))
 
 
 def link_outages(k: Steps, lost: Verdicts, age: Steps, ts: float) -> LinkOutages:

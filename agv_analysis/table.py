@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.channel_fit import Estimate
+from agv_analysis.outages import loss_causes
 
 
 def print_table(analysis: Observations) -> None:
@@ -58,6 +59,8 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     seed = f", seed {run.scenario.relay.seed}" if run.seed_known else ""
     yield "Run", f"{len(run)} steps of {ms:g} ms{seed}"
     yield "Uplink", f"{up.loss_rate:.2%} lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
+    if len(causes := loss_causes(run.uplink)) > 1:
+        yield "Lost by", ", ".join(f"{cause} ({count})" for cause, count in causes.items())
     yield "Longest outage", f"{up.longest} slots ({up.longest * ms:g} ms)"
     yield (
         "Age of information",

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import re
+import textwrap
+from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agv_analysis.cli import main
 from agv_analysis.simulation.verdicts import Air
 from agv_analysis.stability.chain import chain_of
 from agv_plant.channels.schedule import OUTAGE, is_scripted
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import Channel, losses
-from agv_ros.parameters import ParameterError
+from agv_ros.parameters import ParameterError, build
+from agv_ros.ros_yaml import load
 
+REPOSITORY = Path(__file__).parents[1]
 TS, STEPS = 0.005, 9000
 BERNOULLI = ChannelParameters(model="bernoulli", p=0.3)
 
@@ -123,3 +131,40 @@ def test_what_changes_has_no_closed_form() -> None:
 def test_a_schedule_of_another_form_is_refused(schedule: str, complaint: str) -> None:
     with pytest.raises(ParameterError, match=complaint):
         scheduled(schedule)
+
+
+def test_a_run_says_what_lost_its_messages(tmp_path: Path) -> None:
+    """By a schedule and by a model, both counted by hand; the figures are in the table and in the JSON file."""
+    settings = ("relay.uplink.model=bernoulli", "relay.uplink.p=0.1", "relay.uplink.schedule=1: outage=0.5 every 2")
+    arguments = [word for setting in settings for word in ("--set", setting)]
+    done = CliRunner().invoke(
+        main,
+        [
+            "simulate",
+            "config/paper.yaml",
+            *arguments,
+            "--set",
+            "plant.duration=10.0",
+            "--json",
+            str(tmp_path / "a.json"),
+        ],
+    )
+    assert done.exit_code == 0, done.output
+    alone = losses(dataclasses.replace(BERNOULLI, p=0.1), 1, "uplink", 2000, TS)
+    outage = (np.arange(2000) >= 200) & ((np.arange(2000) - 200) % 400 < 100)
+    expected = {"outage": int(outage.sum()), "bernoulli": int((alone & ~outage).sum())}
+    found = json.loads((tmp_path / "a.json").read_text())
+    assert found["loss_causes"] == expected
+    assert found["downlink_loss_causes"] == {}
+    assert f"outage ({expected['outage']}), bernoulli ({expected['bernoulli']})" in done.output
+
+
+def test_the_examples_of_the_page_are_channels() -> None:
+    page = (REPOSITORY / "docs/channels.md").read_text(encoding="utf-8")
+    examples = [block for block in re.findall(r"(?:^    .*\n)+", page, re.MULTILINE) if block.startswith("    uplink:")]
+    models = []
+    for example in examples:
+        values = load(textwrap.dedent(example))["uplink"]
+        if values["model"] != "roadworks":
+            models.append(build(ChannelParameters, values).model)
+    assert models == ["coverage_hole", "bernoulli"]

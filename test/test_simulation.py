@@ -178,6 +178,8 @@ def test_the_csv_file_has_every_number_in_full(tmp_path: Path) -> None:
     assert [row["lost"] == "1" for row in rows] == run.lost.tolist()
     assert [int(row["n_ul"]) for row in rows] == run.n_ul.tolist()
     assert math.isclose(float(rows[-1]["t"]), 199 * 0.005)
+    assert [row["cause"] for row in rows] == ["bernoulli" if lost else "" for lost in run.lost.tolist()]
+    assert {(row["n_dl"], row["gain"], row["downlink_cause"]) for row in rows} == {("0", "nan", "")}
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

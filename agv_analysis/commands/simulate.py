@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from agv_analysis.commands import report_on, with_report, with_settings, write_json
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
     from agv_analysis.run import Run
 
 
@@ -53,15 +57,37 @@ def command(
 
 COLUMNS = (
     "k", "t", "x_c", "y_c", "theta_c", "x_r", "y_r", "theta_r", "v_r", "w_r", "x_e", "y_e", "theta_e", "v", "w", "n_ul",
-    "lost", "downlink_lost",
+    "lost", "downlink_lost", "n_dl", "cause", "gain", "downlink_cause", "downlink_gain",
 )  # fmt: skip
-"""Columns of the CSV file: [s], [m], [rad], [m/s], [rad/s]; x_e .. theta_e as the edge computed them; verdicts 0, 1."""
+"""Columns of the CSV file: [s], [m], [rad], [m/s], [rad/s]; x_e .. theta_e as the edge computed them; verdicts 0, 1.
+
+Causes are those of losses, gains those of the channel [dB], nan where it has none.
+"""
+
+
+def _reasons(run: Run) -> Iterator[NDArray[Any]]:
+    """The columns that come of what a run knows of its links."""
+    assert run.n_dl is not None
+    yield run.n_dl
+    for link in (run.uplink, run.downlink):
+        assert link is not None
+        yield from (link.cause, link.gain)
 
 
 def write_csv(path: Path, run: Run) -> None:
     """Write a run to a CSV file, a row a step, numbers in full precision; a path that cannot be written is an error."""
     flags = (run.lost.astype(int), run.downlink_lost.astype(int))
-    arrays = (run.k, run.time, *run.pose.T, *run.reference.T, *run.error.T, *run.command.T, run.n_ul, *flags)
+    arrays = (
+        run.k,
+        run.time,
+        *run.pose.T,
+        *run.reference.T,
+        *run.error.T,
+        *run.command.T,
+        run.n_ul,
+        *flags,
+        *_reasons(run),
+    )
     try:
         with open(path, "w", encoding="utf-8", newline="") as file:
             rows = csv.writer(file)
