@@ -11,7 +11,7 @@ from agv_analysis.channel_fit import ChannelFit, fit_channel
 from agv_analysis.convergence import Convergence, convergence
 from agv_analysis.outages import Outages, loss_causes, outages
 from agv_analysis.run import Floats, Run
-from agv_analysis.stability import bursts, floquet, lifted, mean_square, paper
+from agv_analysis.stability import bursts, floquet, late, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
 from agv_analysis.stability.linearisation import Edge
 from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED
@@ -247,9 +247,11 @@ def _burst_left(fit: ChannelFit, growth: float, v_r: Floats, w_r: Floats, run: R
 
 def _contractions(run: Run, edge: Edge) -> tuple[float | None, float | None]:
     """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
+    if _is_late(run):
+        return _late_contraction(run, edge), None
     first = int(np.argmin(run.lost))
     steps = len(run) - first
-    if _is_late(run) or run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
+    if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
         return None, None
     lost, reference, gains = run.lost[first:], run.reference[first:], run.scenario.controller
     policy = run.scenario.error_detector.policy
@@ -261,6 +263,18 @@ def _contractions(run: Run, edge: Edge) -> tuple[float | None, float | None]:
         felt = edge.felt(gains)
         of_motion = floquet.trajectory(run.pose[first:], reference, lost, felt, run.ts, policy == "align")
     return of_drops_per_step, _finite(float(np.exp(of_motion[0] / steps)))
+
+
+def _late_contraction(run: Run, edge: Edge) -> float | None:
+    """Growth factor per step about the reference from the first step on; None for what `late` does not know."""
+    is_whole = run.k[0] == 0 and int(run.k[-1]) + 1 == len(run)
+    if edge.predicts or not is_whole or (run.downlink is not None and run.downlink.delay.any()):
+        return None
+    with np.errstate(all="ignore"):
+        growth = late.age_sequence(
+            run.n_ul, run.reference[:, 3], run.reference[:, 4], run.scenario.controller, run.ts, edge
+        )
+    return _finite(float(np.exp(growth / len(run))))
 
 
 def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:

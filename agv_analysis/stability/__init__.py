@@ -6,6 +6,7 @@
     mean_square  random losses, E[|e|^2] dies out: a Markov jump linear system; `almost_sure`: almost every run does
     both_links   the same where commands are lost as well
     floquet      one lap, or one recorded sequence of losses, again and again: what that very lap does
+    late         the same where poses come late and out of order
     empirical    twins that begin apart and meet the same losses: do they come together?
 
 All but the first and the last start from `linearisation`: e(k+1) = F(k) e(k) + G(k) e(k-n).
