@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import struct
 import tracemalloc
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -337,6 +338,18 @@ def little_memory(limit: int) -> Iterator[None]:
         assert tracemalloc.get_traced_memory()[1] < limit
     finally:
         tracemalloc.stop()
+
+
+def test_bombs_whose_checksums_are_right_are_inflated_one_by_one(tmp_path: Path) -> None:
+    """They say that they are empty, but a CRC proves what they hold, so that it is read."""
+    bomb = zstandard.ZstdCompressor().compress(bytes(2**24))
+    head = struct.pack("<QQQI", 0, 0, 0, zlib.crc32(bytes(2**24)))
+    packed = record(6, head + text("zstd") + struct.pack("<Q", len(bomb)) + bomb)
+    (tmp_path / "a.mcap").write_bytes(HEAD + STRING + CHANNEL + 12 * packed + message(2) + END)
+    with little_memory(2**27):
+        bag = read_bag(tmp_path / "a.mcap")
+    assert bag["/text"]["log_time_ns"].tolist() == [2]
+    assert any("byte in a chunk that belongs to no whole record" in problem for problem in bag.problems)
 
 
 def test_memory_goes_with_the_largest_chunks_not_with_the_file(tmp_path: Path) -> None:

@@ -71,6 +71,16 @@ def open_chunk(chunk: Chunk) -> bytes:
     return content
 
 
+def largest_size(chunk: Chunk) -> int:
+    """Most bytes that the chunk can inflate to, whichever of its declarations is true."""
+    compression = compression_of(chunk.content)
+    try:
+        size = declared_size(compression, chunk.content) if compression else len(chunk.content)
+    except DamagedError:
+        size = None
+    return min(MAX_CHUNK, max(chunk.size, size or 0))
+
+
 def is_as_declared(chunk: Chunk, content: bytes) -> bool:
     """Does the record say of the content what is true?"""
     return chunk.size == len(content) and chunk.compression == compression_of(chunk.content)

@@ -31,6 +31,7 @@ from agv_analysis.bags.chunk import (
     cut_chunk,
     is_as_declared,
     is_wrong_length,
+    largest_size,
     messages_at,
     open_chunk,
     rescue_chunk,
@@ -38,7 +39,6 @@ from agv_analysis.bags.chunk import (
     sort_out,
     walk,
 )
-from agv_analysis.bags.compression import MAX_CHUNK
 from agv_analysis.bags.definitions import Definitions
 from agv_analysis.bags.errors import BagError, DamagedError
 from agv_analysis.bags.findings import Findings
@@ -82,6 +82,9 @@ from agv_analysis.bags.storage import LARGE, IsWanted
 _WINDOW = 2**20
 _TOGETHER = 2**22
 """Bytes of chunks, when inflated, that go to the other thread at a time."""
+
+_MOST_TOGETHER = 1000
+"""Chunks that do so at most, however small they are."""
 
 _AHEAD = 3 * _TOGETHER
 """Bytes that may be inflated ahead, unless a single chunk has more."""
@@ -485,12 +488,12 @@ def _ahead(items: Iterator[_Item], is_large: bool) -> Iterator[tuple[_Item, _Ope
 
 def _together(items: Iterator[_Item]) -> Iterator[_Some]:
     """The items, several at a time unless they are large: to wake a thread takes as long as a small chunk does."""
-    some = _Some([], 0)
+    some, size = [], 0
     for item in items:
-        size = min(item.chunk.size, MAX_CHUNK) if isinstance(item, _Packed) else len(item.content)
-        some = _Some([*some.items, item], some.size + size)
-        if some.size >= _TOGETHER:
-            yield some
-            some = _Some([], 0)
-    if some.items:
-        yield some
+        some.append(item)
+        size += largest_size(item.chunk) if isinstance(item, _Packed) else len(item.content)
+        if size >= _TOGETHER or len(some) == _MOST_TOGETHER:
+            yield _Some(some, size)
+            some, size = [], 0
+    if some:
+        yield _Some(some, size)
