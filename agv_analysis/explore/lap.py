@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import multiprocessing
+import os
 import signal
 import threading
 from collections.abc import Callable
@@ -15,6 +16,9 @@ from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
 R = TypeVar("R")
+
+_NICE = 10
+"""What is computed beside gives way to the page and to the browser."""
 
 
 def lap_beside(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:
@@ -57,10 +61,15 @@ class Newest(Generic[R]):
         self._changed = threading.Condition()
         self._newest = 0
         self._busy = False
+        self._of_process = threading.Lock()
         self._process: Any = None
+        self._closed = False
 
     def __call__(self, *arguments: Any) -> R | None:
-        """What the function, one of a module, returns; None if a newer call came before this one had its turn."""
+        """What the function, one of a module, returns.
+
+        None if a newer call came before this one had its turn, or if nothing is computed any more.
+        """
         with self._changed:
             self._newest += 1
             mine = self._newest
@@ -70,26 +79,39 @@ class Newest(Generic[R]):
                 return None
             self._busy = True
         try:
-            return self._other_process().apply(self._function, arguments)  # type: ignore[no-any-return]
+            return self._compute(arguments)
         finally:
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
 
-    def _other_process(self) -> Any:
-        if self._process is None:
-            # Ctrl-C reaches every process of a terminal, and is the page's own to act upon: a process inherits what is
-            # blocked when it begins. Spawned, since the server has threads; multiprocessing's own tracker, which would
-            # come up with it and take the block away, comes first.
-            resource_tracker.ensure_running()
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                self._process = multiprocessing.get_context("spawn").Pool(1)
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        return self._process
+    def _compute(self, arguments: tuple[Any, ...]) -> R | None:
+        with self._of_process:
+            if self._closed:
+                return None
+            self._process = self._process or _begun()
+            coming = self._process.apply_async(self._function, arguments)
+        found: R = coming.get()
+        return found
 
     def close(self) -> None:
-        """End the other process, whatever it is at."""
-        if self._process is not None:
-            self._process.terminate()
+        """End the other process, whatever it is at; no other begins."""
+        with self._of_process:
+            self._closed = True
+            if self._process is not None:
+                self._process.terminate()
+
+
+def _begun() -> Any:
+    """A pool of one process.
+
+    Ctrl-C reaches every process of a terminal, and is the page's own to act upon: a process inherits what is blocked
+    when it begins. It is spawned, since the server has threads; multiprocessing's own tracker, which would come up with
+    it and take the block away, comes first.
+    """
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return multiprocessing.get_context("spawn").Pool(1, os.nice, (_NICE,))
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
