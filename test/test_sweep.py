@@ -182,8 +182,26 @@ def test_margins_are_zero_on_the_borders_of_theory() -> None:
     assert margins(base, axes, [(300.0, p)])["almost surely"][0] == pytest.approx(exponent, rel=1e-9)
 
 
-def test_theory_is_silent_on_a_lossy_downlink() -> None:
-    base = load_scenario(PAPER, (*BERNOULLI, "relay.downlink.model=bernoulli", "relay.downlink.p=0.1"))
+def test_a_border_is_that_of_the_true_speed() -> None:
+    slow = load_scenario(PAPER, (*BERNOULLI, "plant.speed_scale=0.5"))
+    p, a = 0.4, 0.005 * 0.5 * 300.0
+    axes = parse_axis("controller.kx=25,250"), parse_axis("relay.uplink.p=0.1,0.2")
+    found = margins(slow, axes, [(300.0, p)])["mean square"]
+    # E[L] = 1 / (1 - p) of independent losses, E[n] = E[L(L - 1)] / 2 E[L] = p / (1 - p)
+    assert found[0] == pytest.approx(a * (p / (1.0 - p) + 0.5) - 1.0)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ("relay.downlink.model=bernoulli", "relay.downlink.p=0.1"),
+        ("relay.uplink.delay=0.01",),
+        ("relay.downlink.jitter=0.01",),
+        ("error_detector.policy=predict",),
+    ],
+)
+def test_theory_is_silent_on_what_it_does_not_cover(settings: tuple[str, ...]) -> None:
+    base = load_scenario(PAPER, (*BERNOULLI, *settings))
     assert all(np.isnan(found).all() for found in margins(base, (parse_axis("controller.kx=1,2"),), [(1.0,)]).values())
 
 

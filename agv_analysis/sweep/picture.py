@@ -130,7 +130,8 @@ def _between(axis: Axis) -> list[float]:
 def margins(base: Scenario, axes: Sequence[Axis], points: Sequence[tuple[Any, ...]]) -> dict[str, Floats]:
     """How far each point is from the borders of stability along a straight track: negative where it is stable.
 
-    By name of the border, shape (points,); NaN where theory is silent: another channel, losses on the downlink.
+    By name of the border, shape (points,); NaN where theory is silent: another channel, late messages, losses on the
+    downlink, a predicted pose. T_s K_x is that of the AGV's true speed.
 
     mean square:    T_s K_x (E[n_ul] + 1/2) - 1, for independent lengths of outages
     almost surely:  the Lyapunov exponent E[log|1 - T_s K_x L|] / E[L], L steps from one reception to the next
@@ -142,19 +143,23 @@ def margins(base: Scenario, axes: Sequence[Axis], points: Sequence[tuple[Any, ..
 def _margins(scenario: Scenario) -> tuple[float, float]:
     from agv_analysis.stability.almost_sure import exponent_along
 
-    chain, a = _renewals(scenario), scenario.plant.ts * scenario.controller.kx
-    if chain is None:
+    chain, a = _renewals(scenario), scenario.plant.ts * scenario.controller.kx * scenario.plant.speed_scale
+    if chain is None or scenario.error_detector.policy == "predict":
         return math.nan, math.nan
     return a * (chain.mean_age + 0.5) - 1.0, exponent_along(a, chain)
 
 
 def _renewals(scenario: Scenario) -> Chain | None:
-    """The uplink as a chain whose outages have independent lengths; None if it is none, or the downlink loses, too."""
+    """The uplink as a chain whose outages have independent lengths.
+
+    None if it is none, if its messages come late, or if the downlink does anything to its own.
+    """
     from agv_analysis.stability.chain import chain_of
 
-    uplink = scenario.relay.uplink
-    if scenario.relay.downlink.model != "perfect" or (
-        uplink.model == "gilbert_elliott" and (uplink.h, uplink.k) != (0.0, 1.0)
-    ):
+    uplink, downlink = scenario.relay.uplink, scenario.relay.downlink
+    is_late = any(link.delay > 0.0 or link.jitter > 0.0 for link in (uplink, downlink))
+    if is_late or downlink.model != "perfect" or downlink.schedule:
+        return None
+    if uplink.model == "gilbert_elliott" and (uplink.h, uplink.k) != (0.0, 1.0):
         return None
     return chain_of(uplink)
