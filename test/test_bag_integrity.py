@@ -25,7 +25,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from agv_analysis.bags import Bag, BagError, mcap_file, read_bag, rosbags_file
+from agv_analysis.bags import Bag, BagError, mcap_file, read_bag, rosbag2, rosbags_file
 from agv_analysis.bags import bag as bag_module
 from agv_analysis.bags.chunk import sort_out, walk
 from agv_analysis.bags.recover import recover
@@ -497,13 +497,18 @@ def database(path: Path, compression: CompressionMode = CompressionMode.NONE) ->
     writer = Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
     if compression != CompressionMode.NONE:
         writer.set_compression(compression, CompressionFormat.ZSTD)
+    fill(writer)
+    return next(path.glob("*.db3"))
+
+
+def fill(writer: Rosbag2Writer) -> None:
+    """Write the small loop by rosbags."""
     connections: dict[str, Any] = {}
     with writer:
         for ns, topic, content in _messages():
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, content.__msgtype__, typestore=STORE)
             writer.write(connections[topic], ns, bytes(STORE.serialize_cdr(content, content.__msgtype__)))
-    return next(path.glob("*.db3"))
 
 
 def change(path: Path, *statements: str) -> None:
@@ -583,6 +588,64 @@ def test_a_bomb_among_messages_that_are_compressed_one_by_one(tmp_path: Path, mo
     assert len(bag["/clock"]) == STEPS - 2
     assert len(bag["/agv/pose"]) == len(bag["/edge/slot"]) == STEPS
     assert not bag.is_complete
+
+
+# -- compressed as a whole --------------------------------------------------------------------------------------------
+
+
+def packed(path: Path) -> Path:
+    """The small loop as a rosbag2 directory whose MCAP file is compressed as a whole."""
+    writer = Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    fill(writer)
+    return next(path.glob("*.mcap.zstd"))
+
+
+def test_a_file_that_was_compressed_and_cut_gives_what_is_whole_in_it(tmp_path: Path) -> None:
+    file = packed(tmp_path / "bag")
+    whole = rows_without_publish_times(read_bag(file.parent))
+    assert len(whole) == len(_messages())
+    stream, content = zstandard.ZstdCompressor().compressobj(), zstandard.decompress(file.read_bytes(), 2**20)
+    blocks = [
+        stream.compress(content[at : at + 1000]) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+        for at in range(0, len(content), 1000)
+    ]
+    for number in range(1, len(blocks)):
+        file.write_bytes(b"".join(blocks[:number]))
+        bag = read_bag(file.parent)
+        expected = log_times_before(content, 1000 * number)
+        assert rows_without_publish_times(bag) == {ns: whole[ns] for ns in expected}, number
+        assert not bag.is_complete
+    file.write_bytes(b"")
+    with pytest.raises(BagError, match="is empty"):
+        read_bag(file.parent)
+
+
+def rows_without_publish_times(bag: Bag) -> dict[int, tuple[Any, ...]]:
+    return {ns: (row[0], *row[3:]) for ns, row in rows_of(bag).items()}
+
+
+def test_flipped_bits_in_a_compressed_file(tmp_path: Path) -> None:
+    file = packed(tmp_path / "bag")
+    whole, data, draw = rows_without_publish_times(read_bag(file.parent)), file.read_bytes(), random.Random(6)
+    for _ in range(60):
+        damaged = bytearray(data)
+        damaged[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+        file.write_bytes(damaged)
+        try:
+            bag = read_bag(file.parent)
+        except BagError:
+            continue
+        assert bag.problems or rows_without_publish_times(bag) == whole
+
+
+def test_a_bomb_as_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rosbag2, "_ALWAYS_UNPACKED", 2**20)
+    file = packed(tmp_path / "bag")
+    assert len(rows_of(read_bag(file.parent))) == len(_messages())
+    file.write_bytes(zstandard.ZstdCompressor().compress(bytes(2**28)))
+    with little_memory(2**26), pytest.raises(BagError, match="inflates to more than 1000 times its size"):
+        read_bag(file.parent)
 
 
 # -- recovered --------------------------------------------------------------------------------------------------------

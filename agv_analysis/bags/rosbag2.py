@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +18,15 @@ from agv_analysis.bags.mcap_file import McapFile
 from agv_analysis.bags.storage import Storage
 
 METADATA = "metadata.yaml"
+
+_PACKED = ".zstd"
+"""Ending that rosbag2 adds to the files that it compresses as a whole."""
+
+_MOST_TIMES = 1000
+_ALWAYS_UNPACKED = 2**30
+"""A file may inflate to so many times its size, or to so many bytes."""
+
+_PIECE = 2**22
 
 _MAX_METADATA = 2**26
 """Most bytes of a metadata.yaml; that of a bag with a thousand topics and files has one million."""
@@ -52,17 +63,40 @@ def open_files(contents: Contents, keep_attachments: bool = False) -> Iterator[S
     A file that is damaged beyond reading is reported, unless there is no other. Raises BagError.
     """
     for path in contents.files:
-        try:
-            storage = _open(path, contents.is_mcap, keep_attachments)
-        except BagError as error:
-            if len(contents.files) == 1:
-                raise
-            contents.findings.add(f"file that cannot be read ({error})", is_loss=True)
-            continue
-        try:
+        with contextlib.ExitStack() as stack:
+            try:
+                file = path
+                if path.suffix == _PACKED:
+                    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="agv_ncs_"))
+                    file = _unpack(path, Path(folder), contents.findings)
+                storage = _open(file, contents.is_mcap, keep_attachments)
+            except BagError as error:
+                if len(contents.files) == 1:
+                    raise
+                contents.findings.add(f"file that cannot be read ({error})", is_loss=True)
+                continue
+            stack.callback(storage.close)
             yield storage
-        finally:
-            storage.close()
+
+
+def _unpack(path: Path, folder: Path, findings: Findings) -> Path:
+    """A file that was compressed as a whole, inflated, as far as it goes, to a file in `folder`. Raises BagError."""
+    import zstandard
+
+    target = folder / path.stem
+    try:
+        left = max(_ALWAYS_UNPACKED, _MOST_TIMES * path.stat().st_size)
+        with path.open("rb") as packed, target.open("xb") as file:
+            stream = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while left > 0 and (piece := stream.read(_PIECE)):
+                left -= file.write(piece)
+    except zstandard.ZstdError as error:
+        findings.add(f"{path.name}: compressed file that is damaged, read up to there ({error})", is_loss=True)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be unpacked to {folder}: {error.strerror}") from None
+    if left <= 0:
+        raise BagError(f"{path}: inflates to more than {_MOST_TIMES} times its size, as no recording does")
+    return target
 
 
 def _open(path: Path, is_mcap: bool, keep_attachments: bool) -> Storage:
@@ -78,7 +112,7 @@ def _by_name(path: Path) -> Contents:
     names = sorted(
         path.iterdir(), key=lambda file: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", file.name)]
     )
-    mcap = [name for name in names if name.suffix == ".mcap"]
+    mcap = [name for name in names if name.name.endswith((".mcap", f".mcap{_PACKED}"))]
     if mcap:
         return Contents(mcap)
     sqlite = [name for name in names if name.suffix == ".db3"]
@@ -105,9 +139,11 @@ def _by_metadata(path: Path) -> Contents:
         contents = _by_name(path)
         contents.findings.add(f"{METADATA} that is not understood ({type(error).__name__}: {error}), not used")
         return contents
-    if storage != "mcap" or mode in ("file", "message"):
+    if mode == "message" or (storage != "mcap" and mode != "file"):
         return Contents([path], is_mcap=False, counts=counts)
-    contents = Contents([file for file in listed if file.exists()], counts=counts)
+    if mode == "file" and any(file.suffix != _PACKED for file in listed):
+        return Contents([path], is_mcap=False, counts=counts)
+    contents = Contents([file for file in listed if file.exists()], is_mcap=storage == "mcap", counts=counts)
     for file in listed:
         if not file.exists():
             contents.findings.add(f"{file.name} named by {METADATA} but missing", is_loss=True)
