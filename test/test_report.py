@@ -290,7 +290,9 @@ def test_the_sentence_says_how_it_is(lap: Analysis) -> None:
 )
 def test_old_poses_are_no_outages(delay: float, expected: str) -> None:
     late = ("error_detector.track=line", f"relay.uplink.delay={delay}", "plant.duration=10.0")
-    assert sentence(analyse(simulate(scenario_of(*late, config="paper")))) == expected
+    analysis = analyse(simulate(scenario_of(*late, config="paper")))
+    assert sentence(analysis) == expected
+    assert f"relay.uplink.delay is {delay}" in render(analysis)  # which the margins do not know of
 
 
 def test_eigenvalues_that_are_drawn_are_those_that_were_judged(lap: Analysis) -> None:

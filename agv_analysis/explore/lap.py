@@ -34,10 +34,8 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
     What cannot be simulated has no rows: the page says why at once.
     """
     from agv_analysis.analysis import analyse
-    from agv_analysis.commands.stability import rows
-    from agv_analysis.report.page import sentence
+    from agv_analysis.report.page import margin_rows, sentence
     from agv_analysis.simulation.single import simulate
-    from agv_analysis.stability.margins import margins
 
     try:
         analysis = analyse(simulate(scenario))
@@ -45,7 +43,7 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
         if analysis.floquet is not None:
             said = "stable" if analysis.floquet < 1.0 else "unstable"
             found.append(("These very losses", f"{said}, an error grows by a factor {analysis.floquet:.6g} a step"))
-        return found + list(rows(margins(scenario), scenario.plant.ts))
+        return found + list(margin_rows(scenario))
     except UserError:
         return []
 

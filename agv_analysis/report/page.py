@@ -19,6 +19,7 @@ from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
 from agv_analysis.run import Run
+from agv_analysis.scenario import Scenario
 from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 from agv_analysis.version import version
 from agv_cloud.reference import Reference
@@ -168,19 +169,27 @@ def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
         yield name, Text.from_markup(value).plain
 
 
-def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
-    """Margins over the scenario's track, or why there are none."""
+def margin_rows(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """Name and value of each margin of a scenario over its track, and what none of them knows of."""
     from agv_analysis.commands.stability import rows
     from agv_analysis.stability.margins import margins
 
+    found = margins(scenario)
+    yield from rows(found, scenario.plant.ts)
+    if found.left_out:
+        yield "Left out of all of these", ", ".join(found.left_out)
+
+
+def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
+    """Margins over the track of a run, or why there are none."""
     if not isinstance(analysis, Analysis):
         yield "Margins", f"not computed: {GAINS_UNKNOWN}"
         return
     try:
-        if not _drives_its_track(analysis.run):
+        if _drives_its_track(analysis.run):
+            yield from margin_rows(analysis.run.scenario)
+        else:
             yield "Margins", "not computed: the recording's reference is not the track that its parameters name"
-            return
-        yield from rows(margins(analysis.run.scenario), analysis.run.ts)
     except UserError as error:  # a recording may come without the file of its track
         yield "Margins", f"not computed: {error}"
 
