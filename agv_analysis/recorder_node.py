@@ -54,6 +54,9 @@ class RecorderNode(LoopNode[RecorderParameters]):
         settings = self.settings
         self.summary = ""
         self._published: dict[str, Counter[str]] = {}
+        self._published_before: Counter[str] = Counter()
+        """By processes of nodes that were started again since."""
+        self._again: Counter[str] = Counter()
         self._running: set[str] = set()
         self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
         describe = [self._describer(topic, kind) for topic, kind in zip(self._names, TOPICS.values(), strict=True)]
@@ -106,12 +109,16 @@ class RecorderNode(LoopNode[RecorderParameters]):
                 if key.startswith(PUBLISHED) and value.isdecimal()
             }
             if counts:
+                before = self._published.get(status.name, Counter())
+                if any(before[topic] > count for topic, count in counts.items()):  # another process of that name
+                    self._published_before += before
+                    self._again[status.name] += 1
                 self._published[status.name] = Counter(counts)
                 (self._running.discard if ENDED in facts else self._running.add)(status.name)
 
     def missing(self) -> dict[str, int]:
         """Messages by topic that nodes say they have published and that are not here."""
-        published = sum(self._published.values(), Counter())
+        published = sum(self._published.values(), self._published_before)
         recorded = dict(zip(self._names, self._writer.counts, strict=True))
         return {topic: published[topic] - count for topic, count in recorded.items() if published[topic] > count}
 
@@ -137,6 +144,8 @@ class RecorderNode(LoopNode[RecorderParameters]):
             self.summary += ", everything that was published"
         else:
             self.summary += "; no node of the loop said how many it published"
+        if self._again:
+            self.summary += f"; started again: {', '.join(sorted(self._again))}"
         self.get_logger().info(f"{self.settings.bag}: {self.summary}")
 
 

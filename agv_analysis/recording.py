@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis import restarts
 from agv_analysis.bag_writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.convergence import body_errors, wrapped
@@ -24,7 +25,8 @@ from agv_ros.wire import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_qu
 Steps = NDArray[np.int64]
 
 TOPICS = (
-    "agv/pose", "agv/ground_truth", "edge/pose", "edge/slot", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "agv/slot",
+    "agv/pose", "agv/ground_truth", "edge/pose", "edge/slot", "edge/age", "edge/error", "edge/cmd_vel", "agv/cmd_vel",
+    "agv/slot",
 )  # fmt: skip
 
 _NEEDED = ("agv/pose", "edge/slot", "edge/error", "edge/cmd_vel")
@@ -45,8 +47,12 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     bag = read_bag(path, topics=())
     names = loop_topics(bag, path, namespace)
     scenario = _scenario(bag, path, config)
-    bag = read_bag(path, topics=tuple(names.values()))
-    return _run(bag, names, scenario, str(path))
+    bag = read_bag(path, topics=(*names.values(), restarts.TOPIC))
+    run = _run(bag, names, scenario, str(path))
+    if restarts.TOPIC not in bag.topics:
+        return run
+    again = restarts.restarts(bag[restarts.TOPIC], names["agv/pose"].removesuffix("agv/pose"), scenario.grid)
+    return dataclasses.replace(run, notes=(*run.notes, *again))
 
 
 def loop_topics(bag: Bag, path: Path, namespace: str | None) -> dict[str, str]:
@@ -149,6 +155,9 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
             f"of {scenario.plant.start_time:g} s + k * {scenario.plant.ts:g} s: are these the run's parameters?"
         )
     n_ul, lost, uplink = _verdicts(slots, k, scenario.grid)
+    ages = on_steps.get("edge/age", _NOTHING)
+    if len(ages.k):  # the edge stepped by its own clock, and says itself what it held
+        n_ul = _verdicts(ages, k, scenario.grid)[0]
     downlink = on_steps.get("agv/slot")
     n_dl, downlink_lost, of_downlink = (
         (None, np.zeros_like(lost), None) if downlink is None else _verdicts(downlink, k, scenario.grid)
@@ -255,6 +264,8 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
         "edge/error": _where(on_steps["edge/slot"], lambda slots: _stamps(slots, "time_ref") >= grid.start_ns),
         "edge/cmd_vel": on_steps["edge/error"].k,
     }
+    if len(on_steps.get("edge/age", _NOTHING).k):
+        expected["edge/error"] = on_steps["edge/age"].k
     if len(on_steps.get("agv/ground_truth", _NOTHING).k):
         expected["agv/ground_truth"] = poses
     if "agv/slot" in on_steps:

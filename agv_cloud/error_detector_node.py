@@ -77,6 +77,8 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         if self.settings.trigger == TIMER:
             self._age_out = self.output(TimeReference, "edge/age", side=True)
             self.input(kind, "edge/pose", self._keep_pose, self._error_out)
+            # Not used; but a relay, if there is one, may be told to wait until somebody hears its slots.
+            self.input(TimeReference, "edge/slot", lambda _: None)
             is_simulated = bool(self.get_parameter("use_sim_time").value)
             self.create_timer(self.settings.ts, self._tick, clock=self.get_clock() if is_simulated else self._steady)
         else:

@@ -14,6 +14,7 @@ from agv_plant.channels.schedule import Entry, parse_schedule
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.unicycle import STEPS
+from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES, TWIST
 from agv_ros.parameters import LoopParameters, ParameterError, group, parameter, parameters_of
 
 
@@ -219,6 +220,29 @@ class RelayParameters(LoopParameters):
     uplink: ChannelParameters = group(ChannelParameters)
     downlink: ChannelParameters = group(ChannelParameters)
     seed: int = parameter(1, "seed of all random outcomes of the channel", low=0, high=2**62)
+    pose_type: str = parameter(
+        "pose",
+        "type of agv/pose and edge/pose; pose: geometry_msgs/PoseStamped, odometry: nav_msgs/Odometry",
+        choices=POSE_TYPES,
+    )
+    command_type: str = parameter(
+        "twist_stamped",
+        "type of agv/cmd_vel; twist_stamped: geometry_msgs/TwistStamped, as edge/cmd_vel, twist: geometry_msgs/Twist",
+        choices=COMMAND_TYPES,
+    )
+    stamps: str = parameter(
+        "grid",
+        "what stamps may be; grid: sampling instants, others are refused, any: each counts for the nearest step since "
+        "the first, as of a robot with a clock of its own",
+        choices=("grid", "any"),
+    )
+
+    def __post_init__(self) -> None:
+        """Check what no single bound can say."""
+        if self.command_type == TWIST and self.plan_steps:
+            raise ParameterError(
+                "relay.command_type is twist, but plan_steps is not 0: a plan is no geometry_msgs/Twist"
+            )
 
 
 _CHANGEABLE = {

@@ -44,7 +44,7 @@ from agv_ros.wire import (
 )
 
 _REPEAT_AFTER = 0.5
-"""Lockstep: step 0 is sent again after this time [s] without an answer, since a peer may have come up after it."""
+"""Lockstep: a pose is sent again after this time [s] without an answer, if a peer may have come up after it."""
 
 _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_vel", "controller"))
 """A topic that each peer publishes, in the order in which a step passes them."""
@@ -196,20 +196,35 @@ class PlantNode(LoopNode[PlantParameters]):
 
     def _watch_for_answers(self) -> None:
         """Give up, naming the missing peer, when a step stays without an answer for too long."""
-        seen, since, repeated = -1, time.monotonic(), time.monotonic()
+        seen, since, repeated, known = -1, time.monotonic(), time.monotonic(), self._peers()
 
         def watch() -> None:
-            nonlocal seen, since, repeated
+            nonlocal seen, since, repeated, known
             now = time.monotonic()
             if self.k != seen:
+                if seen <= 0 or repeated > since:
+                    known = self._peers()
                 seen, since = self.k, now
             elif now - since > self.settings.answer_timeout:
                 self.fail(self._no_answer())
-            elif self.k == 0 and now - max(since, repeated) > _REPEAT_AFTER and self._pose_out.count:
+            elif now - max(since, repeated) > _REPEAT_AFTER and self._pose_out.count and self._may_be_lost(known):
                 repeated = now
                 self._pose_out.publish(encode_pose(self._measured_pose()))
 
         self.create_timer(min(0.1, self.settings.answer_timeout / 4.0), watch, clock=self._steady)
+
+    def _peers(self) -> frozenset[tuple[str, bytes]]:
+        """Who publishes what the plant waits for: topic and identity of each publisher."""
+        return frozenset(
+            (topic, bytes(info.endpoint_gid))
+            for topic, _ in _PEERS
+            for info in self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+        )
+
+    def _may_be_lost(self, known: frozenset[tuple[str, bytes]]) -> bool:
+        """May the pose of this step have come before a peer was up, be it at the start or started again?"""
+        peers = self._peers()
+        return self.k == 0 or (peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 
     def _no_answer(self) -> str:
         silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)

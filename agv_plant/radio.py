@@ -20,7 +20,7 @@ from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import uniforms
 from agv_ros.parameters import LoopParameters
-from agv_ros.stamps import Grid, Steps
+from agv_ros.stamps import Grid, NearestSteps, Steps
 from agv_ros.wire import DELAYED, DELIVERED, LOST, Slot
 
 _BLOCK = 4096
@@ -194,9 +194,9 @@ class Link:
     what the receiver holds after them, and both are functions of the stamps alone.
     """
 
-    def __init__(self, channel: Channel, grid: Grid) -> None:
+    def __init__(self, channel: Channel, grid: Grid, keeps_to_grid: bool = True) -> None:
         self.channel = channel
-        self._steps = Steps(grid)
+        self._steps = Steps(grid) if keeps_to_grid else NearestSteps(grid.ts_ns)
         self._freshest_ns = 0
         self._under_way: list[tuple[int, float, int, int, bytes]] = []
         self._order = 0
@@ -215,7 +215,7 @@ class Link:
     def transmit(self, stamp_ns: int, message: bytes = b"", place: tuple[float, float] = NOWHERE) -> Passage:
         """The slot of the message with this stamp, sent when the AGV is at `place` [m].
 
-        Raises OffGridError if the stamp is no sampling instant.
+        Raises OffGridError if the stamp is no sampling instant but should be one.
         """
         k = self._steps.of(stamp_ns)
         if k == 0:  # begins a run: whatever is held or under way of a run before it is past

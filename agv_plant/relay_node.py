@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -13,8 +14,17 @@ from agv_plant.channels.placed import NOWHERE
 from agv_plant.parameters import RelayParameters
 from agv_plant.radio import Channel, Link, Passage
 from agv_ros.executor import run_node
+from agv_ros.message_types import ODOMETRY, TWIST
 from agv_ros.node import LoopNode, Output
-from agv_ros.wire import InvalidMessageError, decode_pose, encode_slot, stamp_of
+from agv_ros.wire import (
+    InvalidMessageError,
+    decode_command,
+    decode_odometry,
+    decode_pose,
+    encode_slot,
+    encode_twist,
+    stamp_of,
+)
 
 
 class RelayNode(LoopNode[RelayParameters]):
@@ -23,29 +33,34 @@ class RelayNode(LoopNode[RelayParameters]):
     def __init__(self, **node_options: Any) -> None:
         super().__init__("relay", RelayParameters, **node_options)
         settings = self.settings
+        keeps_to_grid = settings.stamps == "grid"
         self.uplink, self.downlink = (
-            Link(Channel(channel, settings.seed, name, settings.ts), self.grid)
+            Link(Channel(channel, settings.seed, name, settings.ts), self.grid, keeps_to_grid)
             for name, channel in (("uplink", settings.uplink), ("downlink", settings.downlink))
         )
         self._needs_place = settings.uplink.is_placed or settings.downlink.is_placed
         self._place = NOWHERE
-        self._edge_pose = self.output(PoseStamped, "edge/pose")
+        self._is_odometry = settings.pose_type == ODOMETRY
+        pose_kind = Odometry if self._is_odometry else PoseStamped
+        self._edge_pose = self.output(pose_kind, "edge/pose")
         self._edge_slot = self.output(TimeReference, "edge/slot")
         kind, command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
-        self._agv_cmd_vel = self.output(kind, f"agv/{command}")
+        self._loses_stamp = settings.command_type == TWIST
+        self._agv_cmd_vel = self.output(Twist if self._loses_stamp else kind, f"agv/{command}")
         self._agv_slot = self.output(TimeReference, "agv/slot")
-        self.input(PoseStamped, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot)
+        self.input(pose_kind, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot)
         self.input(kind, f"edge/{command}", self._on_command, self._agv_cmd_vel, self._agv_slot)
 
     def _on_pose(self, data: bytes) -> None:
         if self._needs_place:
-            self._place = _place_in(data, self._place)
+            self._place = _place_in(data, self._is_odometry, self._place)
         passage = self.uplink.transmit(stamp_of(data), data, self._place)
         self.report_every_second(passage.slot.stamp_ns)
         _pass_on(passage, self._edge_pose, self._edge_slot)
 
     def _on_command(self, data: bytes) -> None:
-        passage = self.downlink.transmit(stamp_of(data), data, self._place)
+        passed_on = encode_twist(decode_command(data)) if self._loses_stamp else data
+        passage = self.downlink.transmit(stamp_of(data), passed_on, self._place)
         _pass_on(passage, self._agv_cmd_vel, self._agv_slot)
 
     def facts(self) -> dict[str, str]:
@@ -71,10 +86,10 @@ def _counts(name: str, link: Link) -> dict[str, str]:
     }
 
 
-def _place_in(pose: bytes, last: tuple[float, float]) -> tuple[float, float]:
+def _place_in(pose: bytes, is_odometry: bool, last: tuple[float, float]) -> tuple[float, float]:
     """Where a pose says that the AGV is [m]; `last` if it cannot be read, which is for its receiver to complain of."""
     try:
-        return decode_pose(pose)[1:3]
+        return (decode_odometry(pose) if is_odometry else decode_pose(pose))[1:3]
     except InvalidMessageError:
         return last
 

@@ -74,3 +74,20 @@ class Steps:
             )
         self._last = k
         return k
+
+
+class NearestSteps:
+    """Steps of stamps that keep to no grid, as another robot's: each counts for the nearest step since the first."""
+
+    def __init__(self, ts_ns: int) -> None:
+        self._ts_ns = ts_ns
+        self._first_ns = 0
+        self._last = -1
+
+    def of(self, stamp_ns: int) -> int:
+        """Step of a stamp; one before the first, or more than MAX_LEAP steps past the last, is a new first one."""
+        k = (stamp_ns - self._first_ns + self._ts_ns // 2) // self._ts_ns
+        if self._last < 0 or not 0 <= k <= self._last + MAX_LEAP:
+            self._first_ns, k = stamp_ns, 0
+        self._last = k
+        return k

@@ -416,14 +416,23 @@ EDGE_OF_A_ROBOT = {"ts": 0.02, "track": "line", "speed": 0.2, "track_start": [0.
 ROBOT_S_TOPICS = ["-r", "edge/pose:=diff_drive_controller/odom", "-r", "edge/cmd_vel:=diff_drive_controller/cmd_vel"]
 
 
+@pytest.mark.parametrize("through_the_relay", [False, True], ids=["direct", "relay"])
 @pytest.mark.parametrize("command_type", ["twist_stamped", "twist"])
 def test_the_edge_drives_a_robot_that_is_not_ours_and_it_halts_without_the_edge(
-    bench: Bench, command_type: str
+    bench: Bench, command_type: str, through_the_relay: bool
 ) -> None:
     robot = Robot(bench.context, command_type == "twist_stamped")
     bench.executor.add_node(robot)
     bench.nodes.append(robot)
-    remapped = {"cli_args": ["--ros-args", *ROBOT_S_TOPICS]}
+    remapped = {} if through_the_relay else {"cli_args": ["--ros-args", *ROBOT_S_TOPICS]}
+    if through_the_relay:
+        to_the_robot = [topic.replace("edge/", "agv/") for topic in ROBOT_S_TOPICS]
+        relay = bench.add(
+            functools.partial(RelayNode, cli_args=["--ros-args", *to_the_robot]), ts=0.02, stamps="any",
+            pose_type="odometry", command_type=command_type, uplink__model="bernoulli", uplink__p=0.2,
+            downlink__model="bernoulli", downlink__p=0.2,
+        )  # fmt: skip
+        command_type = "twist_stamped"
     controller = bench.add(
         functools.partial(ControllerNode, **remapped), ts=0.02, command_type=command_type, kx=2.0, ky=60.0, ktheta=15.0,
         v_max=1.0,
@@ -435,6 +444,9 @@ def test_the_edge_drives_a_robot_that_is_not_ours_and_it_halts_without_the_edge(
     errors = bench.received(Odometry, "edge/error")
     bench.until(lambda: robot.driven > 50 and abs(robot.y - 0.3) < 0.02)  # it has found the line 0.3 m beside it
     bench.until(lambda: abs(errors[-1].pose.pose.position.x) < 0.1)  # and goes along with the reference
+    if through_the_relay:
+        assert relay.rejected == {}
+        bench.until(lambda: min(relay.uplink.lost, relay.downlink.lost) > 0)
     assert robot.x > 0.0
     assert controller.rejected == detector.rejected == {}
     # The edge's clock minus the robot's, plus the least delay: some 3 s behind.
@@ -536,6 +548,35 @@ def test_lockstep_names_the_missing_peer(start: Start, running: tuple[str, ...],
     assert status == 1
     assert said.splitlines()[-1] == (f"no answer to step 0 on agv/cmd_vel within 2 s: is the {silent} running?")
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("name", ["controller", "error_detector", "relay"])
+def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Start, tmp_path: Path, name: str) -> None:
+    from agv_analysis.recording import read_run
+
+    params = tmp_path / "params.yaml"
+    params.write_text("plant: {ros__parameters: {duration: 10.0, answer_timeout: 60.0}}")
+    arguments = ["--ros-args", "--params-file", str(params), "-p", "wait_for_subscribers:=2"]
+    bag = ["-p", f"bag:={tmp_path / 'bag'}", "-p", f"params_file:={params}", "-p", "stop_timeout:=30.0"]
+    recorder = start("agv_analysis.recorder_node", *arguments, *bag, "-p", "log_time:=stamp")
+    modules = {kind.rpartition(".")[2].removesuffix("_node"): kind for kind in NODES}
+    running = {node: start(module, *arguments) for node, module in modules.items()}
+    running["plant"].wait_for("step 500 of")
+    running[name].process.send_signal(signal.SIGTERM)
+    assert running[name].end()[0] == 0
+    running[name] = start(modules[name], *arguments)
+    status, said = running["plant"].end(120.0)
+    assert (status, "Traceback" in said) == (0, False)
+    for node in (*(running[other] for other in running if other != "plant"), recorder):
+        node.process.send_signal(signal.SIGTERM)
+        status, said = node.end()
+        assert (status, "Traceback" in said) == (0, False)
+    assert f"started again: {name}" in said
+    run = read_run(tmp_path / "bag")
+    assert len(run) == 2000
+    assert abs(run.reference[-1, 1] - run.pose[-1, 1]) < 0.01
+    assert [note for note in run.notes if note.startswith(f"{name} was started again")]
+    assert not [note for note in run.notes if "was started again" in note and not note.startswith(name)]
 
 
 def test_a_node_with_a_wrong_parameter_says_so_in_one_line(start: Start) -> None:

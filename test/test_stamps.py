@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_ros.stamps import MAX_FIRST, MAX_LEAP, Grid, OffGridError, Steps, to_nanoseconds
+from agv_ros.stamps import MAX_FIRST, MAX_LEAP, Grid, NearestSteps, OffGridError, Steps, to_nanoseconds
 
 grids = st.builds(Grid, st.integers(1, 2 * 10**18), st.integers(1000, 10**10))
 
@@ -76,3 +76,11 @@ def test_a_node_may_join_a_loop_that_has_run_for_days_but_not_one_of_another_clo
     since_1970 = 1_800_000_000 * 200
     with pytest.raises(OffGridError, match="do all nodes have the same start_time"):
         Steps(grid).of(grid.stamp(since_1970))
+
+
+def test_stamps_off_the_grid_count_for_the_nearest_step_since_the_first() -> None:
+    steps, first = NearestSteps(20), 1_700_000_000
+    assert [steps.of(first + ns) for ns in (0, 9, 10, 29, 30, 55, 41, 1000)] == [0, 0, 1, 1, 2, 3, 2, 50]
+    assert steps.of(first - 500) == 0  # its clock began anew
+    assert steps.of(first - 480) == 1
+    assert steps.of(first + 20 * (MAX_LEAP + 100)) == 0  # or leapt

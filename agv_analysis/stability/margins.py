@@ -30,7 +30,7 @@ LONGEST_DELAY, LONGEST_DELAY_PREDICTED = 10_000, 1000
 _KNOWN_TO_CRITERIA = {
     *(f"plant.{name}" for name in SHARED),
     *(f"plant.{name}" for name in ("initial_pose", "integration", "clock", "duration", "speed_scale")),
-    *(f"plant.{name}" for name in ("answer_timeout", "cmd_vel_timeout", "downlink_policy", "ramp_time")),
+    *(f"plant.{name}" for name in ("answer_timeout", "cmd_vel_timeout", "downlink_policy", "ramp_time", "seed")),
 }
 """Parameters of the plant that criteria ask for, that do not matter to them, or only where commands are lost."""
 
