@@ -92,6 +92,9 @@ CHANNELS = {
     "gilbert_elliott": (*LOSSY, "relay.uplink.k=0.95"),
     "burst": ("relay.uplink.model=burst", "relay.uplink.n=11"),
     "trace": ("relay.uplink.model=trace",),
+    "coverage_hole": ("relay.uplink.model=coverage_hole", "relay.uplink.hole_circles=[0.3, 0.4, 0.4]"),
+    "rayleigh": ("relay.uplink.model=rayleigh", "relay.uplink.margin=6.0"),
+    "late": (*LOSSY, "relay.uplink.delay=0.01", "relay.uplink.jitter=0.015", "relay.downlink.delay=0.007"),
 }
 TRACKS = ("paper", "line", "circle", "eight", "warehouse", "csv")
 LIMITED = {"limited": "controller.v_max=2.0", "unlimited": "controller.v_max=.inf"}
