@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agv_ros.parameters import LoopParameters, parameter
+from agv_ros.parameters import TwoDomains, parameter
 
 
 @dataclass(frozen=True)
-class RecorderParameters(LoopParameters):
+class RecorderParameters(TwoDomains):
     """Parameters of the node `recorder`."""
 
     bag: str = parameter("bag", "directory to record to, which must not exist")

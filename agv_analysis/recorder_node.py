@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration, Infinite
+from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
@@ -58,14 +59,22 @@ class RecorderNode(LoopNode[RecorderParameters]):
         """By processes of nodes that were started again since."""
         self._again: Counter[str] = Counter()
         self._running: set[str] = set()
+        agv, edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
+        everywhere = [agv] if edge is agv else [agv, edge]
+        sides = [[edge] if topic.startswith("edge/") else [agv] for topic in TOPICS]
+        sides[list(TOPICS).index("/diagnostics")] = everywhere
         self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
-        describe = [self._describer(topic, kind) for topic, kind in zip(self._names, TOPICS.values(), strict=True)]
+        describe = [
+            self._describer(topic, kind, where)
+            for topic, kind, where in zip(self._names, TOPICS.values(), sides, strict=True)
+        ]
         self._writer = BagWriter(Path(settings.bag), describe, self.about())
         self._now_ns: Callable[[int], int] = (
             (lambda stamp_ns: stamp_ns) if settings.log_time == "stamp" else (lambda _: time.time_ns())
         )
         for number, (topic, kind) in enumerate(TOPICS.items()):
-            self.input(kind, topic, self._receiver(number))
+            for side in sides[number]:
+                self.input(kind, topic, self._receiver(number), on=side)
 
     def about(self) -> dict[str, str]:
         """What is embedded in the bag. Raises UserError."""
@@ -84,13 +93,13 @@ class RecorderNode(LoopNode[RecorderParameters]):
 
         return record_diagnostics if self._names[number] == "/diagnostics" else record
 
-    def _describer(self, topic: str, kind: type) -> Callable[[], TopicInfo]:
+    def _describer(self, topic: str, kind: type, sides: Sequence[Node]) -> Callable[[], TopicInfo]:
         module = kind.__module__.split(".")
         type_name = f"{module[0]}/{module[1]}/{kind.__name__}"
         schema = schema_of(type_name)  # now, not in the middle of a run in real time
 
         def describe() -> TopicInfo:
-            publishers = self.get_publishers_info_by_topic(topic)
+            publishers = [info for side in sides for info in side.get_publishers_info_by_topic(topic)]
             offered = [_qos(info.qos_profile) for info in publishers]
             distinct = [qos for i, qos in enumerate(offered) if qos not in offered[:i]]
             type_hash = str(publishers[0].topic_type_hash) if publishers else ""

@@ -35,7 +35,7 @@ from agv_plant.plant_node import PlantNode, progress_of
 from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
 from agv_ros.errors import UserError
-from agv_ros.executor import EXECUTORS, Stop, spin, spin_for, stop_on_signals
+from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
 from agv_ros.parameters import LoopParameters, as_dict
 from agv_ros.wire import Command, TrackingError
@@ -102,9 +102,13 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
     """
     connected = _connected(scenario, recorded=bag is not None)
     with stop_on_signals() as stop, _params_file(scenario) as params, OneProcess() as process:
-        plant = process.add(PlantNode, connected.plant)
+        plant = process.add(PlantNode, connected.plant, domain_id=connected.domain_of("plant"))
         rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # its Outcome says the same
-        loop = [plant, *(process.add(NODES[name], getattr(connected, name)) for name in SCHEMAS if name != "plant")]
+        others = [name for name in SCHEMAS if name != "plant"]
+        loop = [
+            plant,
+            *(process.add(NODES[n], getattr(connected, n), domain_id=connected.domain_of(n)) for n in others),
+        ]
         recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params), RecorderNode)
         return run_nodes(EXECUTORS[executor](context=process.context), plant, loop, recorder, stop, progress)
 
@@ -144,22 +148,29 @@ class OneProcess:
 
     def __init__(self, namespace: str = "") -> None:
         self.context = rclpy.Context()
+        self._contexts: dict[int, rclpy.Context] = {}
         self._namespace = namespace
         self._stack = ExitStack()
 
     def __enter__(self) -> OneProcess:
-        rclpy.init(context=self.context, signal_handler_options=SignalHandlerOptions.NO)
-        self._stack.callback(self.context.try_shutdown)
+        self._enter_domain(self.context, None)
         return self
+
+    def _enter_domain(self, context: rclpy.Context, domain_id: int | None) -> None:
+        rclpy.init(context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
+        self._contexts[context.get_domain_id()] = context
+        self._stack.callback(context.try_shutdown)
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def add(self, make: Callable[..., N], settings: object, use_sim_time: bool = False) -> N:
-        """Make a node with these settings."""
+    def add(self, make: Callable[..., N], settings: object, use_sim_time: bool = False, domain_id: int = -1) -> N:
+        """Make a node with these settings, in a DDS domain of its own if it is to have one."""
+        if domain_id >= 0 and domain_id not in self._contexts:
+            self._enter_domain(rclpy.Context(), domain_id)
         node = make(
             parameter_overrides=[*overrides(settings), Parameter("use_sim_time", value=use_sim_time)],
-            context=self.context, use_global_arguments=False, namespace=self._namespace,
+            context=self._contexts.get(domain_id, self.context), use_global_arguments=False, namespace=self._namespace,
         )  # fmt: skip
         self._stack.callback(node.destroy_node)
         return node
@@ -180,7 +191,7 @@ def run_nodes(
 ) -> Outcome:
     """Run the nodes of a loop until the one that says when a step is over, plant or player, has done all steps."""
     for node in loop if recorder is None else (*loop, recorder):
-        executor.add_node(node)
+        add(executor, node)
     pace = _Pace()
 
     def is_done() -> bool:
@@ -229,7 +240,10 @@ def _connected(scenario: Scenario, recorded: bool) -> Scenario:
 
 def _recording(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
     log_time = "stamp" if scenario.plant.clock == "lockstep" else "receive"
-    return RecorderParameters(bag=str(bag), params_file=str(params), log_time=log_time, stop_timeout=_PATIENCE)
+    return RecorderParameters(
+        bag=str(bag), params_file=str(params), log_time=log_time, stop_timeout=_PATIENCE,
+        plant_domain_id=scenario.relay.plant_domain_id, edge_domain_id=scenario.relay.edge_domain_id,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -273,7 +287,7 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
             if bag is not None:
                 nodes["recorder"] = _Process("recorder", params, as_dict(_recording(scenario, bag, params)))
             for name in reversed(SCHEMAS):
-                nodes[name] = _Process(name, connected_params, {})
+                nodes[name] = _Process(name, connected_params, {}, connected.domain_of(name))
             outcome = _watch(nodes, stop, progress)
             return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
         finally:
@@ -310,7 +324,7 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
 class _Process:
     """One node in a process of its own, with what it says."""
 
-    def __init__(self, name: str, params: Path, settings: dict[str, Any]) -> None:
+    def __init__(self, name: str, params: Path, settings: dict[str, Any], domain_id: int = -1) -> None:
         self.name = name
         self.steps = 0
         self.pace = _Pace()
@@ -318,10 +332,11 @@ class _Process:
         command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
         for parameter, value in settings.items():
             command += ["-p", f"{parameter}:={json.dumps(value)}"]
+        domain = {"ROS_DOMAIN_ID": str(domain_id)} if domain_id >= 0 else {}
         # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order.
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **domain},
         )  # fmt: skip
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

@@ -37,6 +37,11 @@ class Scenario:
         """The sampling instants."""
         return Grid.of(self.plant.start_time, self.plant.ts)
 
+    def domain_of(self, node: str) -> int:
+        """ROS_DOMAIN_ID that the params file wants for a node, -1 for the usual one; the relay's is the AGV's."""
+        at_edge = node in ("error_detector", "controller")
+        return self.relay.edge_domain_id if at_edge else self.relay.plant_domain_id
+
     def to_yaml(self) -> str:
         """The whole scenario as a ROS 2 params file, with every default written out."""
         return dump({node: {"ros__parameters": _plain(as_dict(getattr(self, node)))} for node in SCHEMAS})

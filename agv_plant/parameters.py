@@ -15,7 +15,7 @@ from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES, TWIST
-from agv_ros.parameters import LoopParameters, ParameterError, group, parameter, parameters_of
+from agv_ros.parameters import LoopParameters, ParameterError, TwoDomains, group, parameter, parameters_of
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class ChannelParameters:
 
 
 @dataclass(frozen=True)
-class RelayParameters(LoopParameters):
+class RelayParameters(TwoDomains):
     """Parameters of the node `relay`."""
 
     uplink: ChannelParameters = group(ChannelParameters)

@@ -1,4 +1,7 @@
-"""The radio link: the only way between the AGV and the edge."""
+"""The radio link: the only way between the AGV and the edge.
+
+With a DDS domain for each of them it is so by construction, and looks that nobody builds another way.
+"""
 
 from __future__ import annotations
 
@@ -26,6 +29,9 @@ from agv_ros.wire import (
     stamp_of,
 )
 
+_LOOK_PERIOD = 1.0
+"""How often [s] the relay looks whether anything but itself joins the AGV's domain and the edge's."""
+
 
 class RelayNode(LoopNode[RelayParameters]):
     """Forwards, delays or loses each message as it is, and says which in the slot."""
@@ -40,18 +46,37 @@ class RelayNode(LoopNode[RelayParameters]):
         )
         self._needs_place = settings.uplink.is_placed or settings.downlink.is_placed
         self._place = NOWHERE
-        self._is_odometry = settings.pose_type == ODOMETRY
+        self._is_new = True
+        self._is_odometry, self._loses_stamp = settings.pose_type == ODOMETRY, settings.command_type == TWIST
         pose_kind = Odometry if self._is_odometry else PoseStamped
-        self._edge_pose = self.output(pose_kind, "edge/pose")
-        self._edge_slot = self.output(TimeReference, "edge/slot")
-        kind, command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
-        self._loses_stamp = settings.command_type == TWIST
-        self._agv_cmd_vel = self.output(Twist if self._loses_stamp else kind, f"agv/{command}")
-        self._agv_slot = self.output(TimeReference, "agv/slot")
-        self.input(pose_kind, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot)
-        self.input(kind, f"edge/{command}", self._on_command, self._agv_cmd_vel, self._agv_slot)
+        kind, self._command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
+        self._agv, self._edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
+        self._edge_pose = self.output(pose_kind, "edge/pose", on=self._edge)
+        self._edge_slot = self.output(TimeReference, "edge/slot", on=self._edge)
+        self._agv_cmd_vel = self.output(Twist if self._loses_stamp else kind, f"agv/{self._command}", on=self._agv)
+        self._agv_slot = self.output(TimeReference, "agv/slot", on=self._agv)
+        self.input(pose_kind, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot, on=self._agv)
+        self.input(kind, f"edge/{self._command}", self._on_command, self._agv_cmd_vel, self._agv_slot, on=self._edge)
+        if self._agv is not self._edge:
+            self.create_timer(_LOOK_PERIOD, self._look_for_ways_around, clock=self._steady)
+
+    def _look_for_ways_around(self) -> None:
+        """End the run if anything but this relay joins the domains of the AGV and of the edge."""
+        ways = [
+            (self._edge, "agv/pose", 0), (self._edge, "edge/pose", 1),
+            (self._agv, f"edge/{self._command}", 0), (self._agv, f"agv/{self._command}", 1),
+        ]  # fmt: skip
+        for side, topic, own in ways:
+            if side.count_publishers(topic) > own:
+                self.fail(
+                    f"{topic} comes into domain {side.context.get_domain_id()} around the relay: "
+                    "what this run shows would not be what the channel does; end whatever else publishes it there"
+                )
 
     def _on_pose(self, data: bytes) -> None:
+        if self._is_new and self._agv is not self._edge:
+            self._look_for_ways_around()  # before the first pose is passed on, and every now and then from then on
+        self._is_new = False
         if self._needs_place:
             self._place = _place_in(data, self._is_odometry, self._place)
         passage = self.uplink.transmit(stamp_of(data), data, self._place)

@@ -69,6 +69,12 @@ def spin_for(executor: Executor, is_done: Callable[[], bool], seconds: float) ->
     return is_done()
 
 
+def add(executor: Executor, node: LoopNode[Any]) -> None:
+    """Let an executor run a node, in all DDS domains that it is in."""
+    for side in (node, *node.sides):
+        executor.add_node(side)
+
+
 def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = None) -> None:
     """Body of a node's `main`: make it, run it until it ends or is told to stop, and exit with its status.
 
@@ -91,7 +97,7 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     except UserError as error:
         return str(error)
     executor = EventsExecutor()
-    executor.add_node(node)
+    add(executor, node)
     spin(executor, lambda: node.finished or stop.requested)
     deadline = time.monotonic() + (node.settings.stop_timeout if stop.requested else LAST_FLUSH_TIMEOUT)
     spin_for(executor, node.is_settled, deadline - time.monotonic())

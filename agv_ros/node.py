@@ -10,9 +10,11 @@ from collections.abc import Callable
 from copy import copy
 from typing import Any, Generic, TypeVar
 
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.exceptions import (
     InvalidParameterTypeException,
@@ -24,6 +26,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
 
 from agv_ros.errors import UserError
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
@@ -93,24 +96,59 @@ class LoopNode(Node, Generic[P]):
         self._last_ns = self.grid.start_ns
         self._ended = False
         self._changes: dict[str, str] = {}
+        self._uses_arguments = node_options.get("use_global_arguments", True)
+        self.sides: list[Node] = []
+        """What this node is in other DDS domains; to be spun with it."""
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
+    # -- domains -----------------------------------------------------------------------------------------------------
+
+    def in_domain(self, domain_id: int) -> Node:
+        """The node in a DDS domain: itself in its own, or if the id is negative; elsewhere another of its name."""
+        for known in (self, *self.sides):
+            if domain_id < 0 or known.context.get_domain_id() == domain_id:
+                return known
+        context = Context()
+        arguments: list[str] | None = None if self._uses_arguments else []
+        rclpy.init(args=arguments, context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
+        self.sides.append(
+            Node(
+                self.get_name(), context=context, namespace=self.get_namespace(), start_parameter_services=False,
+                enable_rosout=False, use_global_arguments=self._uses_arguments,
+            )
+        )  # fmt: skip
+        return self.sides[-1]
+
+    def destroy_node(self) -> None:
+        """Leave all domains."""
+        for side in self.sides:
+            side.destroy_node()
+            side.context.try_shutdown()
+        self.sides.clear()
+        super().destroy_node()
+
     # -- topics ------------------------------------------------------------------------------------------------------
 
-    def output(self, kind: type, topic: str, *, side: bool = False) -> Output:
-        """Publisher of serialised messages of type `kind`; `side`: no node of the loop listens to it."""
-        publisher = self.create_publisher(
+    def output(self, kind: type, topic: str, *, side: bool = False, on: Node | None = None) -> Output:
+        """Publisher of serialised messages of type `kind`; `side`: no node of the loop listens to it.
+
+        `on` is this node `in_domain`.
+        """
+        publisher = (on or self).create_publisher(
             kind, topic, copy(LOOP_QOS), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
         self.outputs.append(Output(publisher, side))
         return self.outputs[-1]
 
-    def input(self, kind: type, topic: str, callback: Callable[[bytes], None], *feeds: Output) -> None:
+    def input(
+        self, kind: type, topic: str, callback: Callable[[bytes], None], *feeds: Output, on: Node | None = None
+    ) -> None:
         """Subscription to serialised messages; what `callback` refuses is counted under `topic`.
 
         It is made as soon as each output that it `feeds` has the wanted number of subscribers. A loop thus comes up
-        backwards, from the plant's inputs to its output, and its first message is not lost.
+        backwards, from the plant's inputs to its output, and its first message is not lost. `on` is this node
+        `in_domain`.
         """
 
         def receive(data: bytes) -> None:
@@ -124,7 +162,7 @@ class LoopNode(Node, Generic[P]):
         def subscribe_when_heard() -> bool:
             if not all(output.is_heard(self.settings.wait_for_subscribers) for output in feeds):
                 return False
-            self.create_subscription(
+            (on or self).create_subscription(
                 kind, topic, receive, copy(LOOP_QOS), raw=True,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )  # fmt: skip

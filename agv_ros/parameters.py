@@ -245,3 +245,17 @@ class LoopParameters:
 
 
 SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_steps", "frame_prefix")
+
+
+@dataclass(frozen=True)
+class TwoDomains(LoopParameters):
+    """What a node must know that stands between the AGV and the edge where each has a DDS domain of its own."""
+
+    plant_domain_id: int = parameter(
+        -1, "ROS_DOMAIN_ID of the AGV; -1: the one that this process was started in", low=-1, high=232
+    )
+    edge_domain_id: int = parameter(
+        -1, "ROS_DOMAIN_ID of the edge; another than the AGV's makes the relay the only way between them; -1: the one "
+        "that this process was started in",
+        low=-1, high=232,
+    )  # fmt: skip

@@ -56,6 +56,15 @@ def _ros_home(tmp_path_factory: pytest.TempPathFactory) -> None:
     os.environ["ROS_HOME"] = str(tmp_path_factory.mktemp("ros_home"))
 
 
+@pytest.fixture
+def two_domains() -> Iterator[tuple[int, int]]:
+    """Two more DDS domains that no other test process has."""
+    claims = [_claim_domain() for _ in range(2)]
+    yield claims[0][0], claims[1][0]
+    for _, claim in claims:
+        claim.close()
+
+
 Lap = Callable[..., tuple["Floats", "Floats", "Floats"]]
 
 
