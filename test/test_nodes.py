@@ -378,6 +378,7 @@ class Robot(Node):
         super().__init__("robot", context=context, use_global_arguments=False)
         self.x = self.y = self.theta = 0.0
         self._command = (0, 0.0, 0.0)
+        self._moved_ns = self._now_ns()
         self.halts = self.driven = 0
         self._odometry = self.create_publisher(Odometry, "diff_drive_controller/odom", 10)
         kind, take = (TwistStamped, self._take_stamped) if is_stamped else (Twist, self._take)
@@ -401,10 +402,12 @@ class Robot(Node):
             self.halts += 1
         else:
             self.driven += 1
-        self.x, self.y, self.theta = arc_step(self.x, self.y, self.theta, v, w, self.PERIOD)
+        now_ns = self._now_ns()  # it moves on while a busy machine does not call
+        elapsed, self._moved_ns = 1e-9 * (now_ns - self._moved_ns), now_ns
+        self.x, self.y, self.theta = arc_step(self.x, self.y, self.theta, v, w, elapsed)
         message = Odometry()
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self._now_ns(), 1_000_000_000)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(now_ns, 1_000_000_000)
         message.pose.pose.position.x, message.pose.pose.position.y = self.x, self.y
         message.pose.pose.orientation.z = math.sin(0.5 * self.theta)
         message.pose.pose.orientation.w = math.cos(0.5 * self.theta)
