@@ -11,11 +11,11 @@ from agv_analysis.channel_fit import ChannelFit, fit_channel
 from agv_analysis.convergence import Convergence, convergence
 from agv_analysis.outages import Outages, loss_causes, outages
 from agv_analysis.run import Floats, Run
-from agv_analysis.stability import bursts, floquet, late, lifted, mean_square, paper
+from agv_analysis.stability import both_links, bursts, floquet, late, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
 from agv_analysis.stability.linearisation import Edge
 from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED
-from agv_analysis.stability.verdict import Verdict, judge, judge_late
+from agv_analysis.stability.verdict import Verdict, judge, judge_both_links, judge_late
 from agv_ros.errors import UserError
 
 
@@ -111,7 +111,7 @@ class Analysis(Observations):
     bursts: BurstVerdict
     """Verdict for arbitrary bursts of up to as many lost poses as the longest outage of the run."""
     mean_square_growth: float
-    """Growth (logarithm, per step) of E[e^2] under the fitted channel."""
+    """Growth (logarithm, per step) of E[e^2] under the fitted channel, or both of them where commands were lost."""
     floquet: float | None
     """Growth factor per step of a small error under the run's own sequence of losses; None where steps are missing."""
     contraction: float | None
@@ -193,16 +193,18 @@ def analyse(run: Run) -> Analysis:
     out, fit = outages(run), fit_channel(run.lost)
     v_r, w_r, gains = run.reference[:, 3], run.reference[:, 4], run.scenario.controller
     edge = Edge.of(run.scenario)
-    growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain, edge=edge) / len(run)
+    both = _growth_on_both_links(run, fit, edge)
+    growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain, edge=edge) / len(run) if both is None else both
     of_drops, of_motion = _contractions(run, edge)
     longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
     n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
     radius = _lifted_radius(out.n_ul_max, v_r, w_r, run, edge)
-    verdict = (
-        judge_late(_constant_delay(run), radius, gains.v_max)
-        if _is_late(run)
-        else judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max)
-    )
+    if _is_late(run):
+        verdict = judge_late(_constant_delay(run), radius, gains.v_max)
+    elif run.downlink_lost.any():
+        verdict = judge_both_links(both, run.scenario.plant.downlink_policy, gains.v_max)
+    else:
+        verdict = judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max)
     return Analysis(
         run=run,
         outages=out,
@@ -216,6 +218,19 @@ def analyse(run: Run) -> Analysis:
         contraction=of_motion,
         verdict=verdict,
     )
+
+
+def _growth_on_both_links(run: Run, fit: ChannelFit, edge: Edge) -> float | None:
+    """Growth of E[e^2] per step under both fitted channels; None if no command was lost, or for other policies."""
+    policy = run.scenario.plant.downlink_policy
+    if policy not in both_links.POLICIES or not run.downlink_lost.any():
+        return None
+    down = fit_channel(run.downlink_lost).chain
+    speeds = run.reference[:, 3], run.reference[:, 4]
+    growth = both_links.lap_growth(
+        *speeds, run.scenario.controller, run.ts, fit.chain, down, edge, stops=policy == "zero"
+    )
+    return growth / len(run)
 
 
 def _is_late(run: Run) -> bool:

@@ -95,7 +95,8 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
     )
     yield f"Any outages up to {analysis.n} slots", _bursts(analysis)
     growth = math.exp(analysis.mean_square_growth)
-    yield "Mean square", _verdict(growth < 1.0, f"E\\[e^2] times {growth:.6g} a step under the fitted channel")
+    both = " of both links" if analysis.verdict.criterion == "both_links" else ""
+    yield "Mean square", _verdict(growth < 1.0, f"E\\[e^2] times {growth:.6g} a step under the fitted channel{both}")
     if analysis.floquet is not None:
         motion = "" if analysis.contraction is None else f", {analysis.contraction:.6g} about the motion"
         told = f"times {analysis.floquet:.6g} a step about the reference{motion}"

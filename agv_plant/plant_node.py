@@ -222,12 +222,19 @@ class PlantNode(LoopNode[PlantParameters]):
         )
 
     def _may_be_lost(self, known: frozenset[tuple[str, bytes]]) -> bool:
-        """May the pose of this step have come before a peer was up, be it at the start or started again?"""
+        """May the pose of this step have come before a peer was up, be it at the start or started again?
+
+        Not at the start if this node has waited for its peers: then a machine is busy, and step 0 is sent once.
+        """
+        if self.k == 0 and self.settings.wait_for_subscribers == 0:
+            return True
         peers = self._peers()
-        return self.k == 0 or (peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
+        return bool(peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 
     def _no_answer(self) -> str:
         silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)
+        if silent == "relay" and self.count_publishers("agv/slot"):  # the edge has a domain of its own
+            silent = "edge, with error_detector and controller,"
         question = (
             f"is the {silent} running?"
             if silent

@@ -133,6 +133,22 @@ def test_random_losses_on_both_sides_of_the_mean_square_border(p: float, word: s
     assert found.verdict.word == (word if found.n > 14 else "asymptotic")
 
 
+@pytest.mark.parametrize(("p", "word"), [(0.6, "mean-square"), (0.95, "unstable")])
+def test_losses_on_both_links_are_judged_together(p: float, word: str) -> None:
+    """Each link alone is stable up to 0.88 at K_x = 25; test_stability_both_links drives twins on both sides."""
+    lossy = ("relay.{}.model=bernoulli", f"relay.{{}}.p={p}")
+    settings = [setting.format(link) for link in ("uplink", "downlink") for setting in lossy]
+    found = of(*settings, "error_detector.track=line", "plant.duration=20.0")
+    assert (found.verdict.word, found.verdict.criterion) == (word, "both_links")
+
+
+def test_a_downlink_policy_that_no_criterion_covers() -> None:
+    lossy = ("relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "plant.downlink_policy=ramp")
+    found = of(*lossy, "plant.duration=5.0")
+    assert found.verdict.word == "unknown"
+    assert "ramp" in found.verdict.margin
+
+
 def test_a_perfect_channel() -> None:
     found = of("plant.duration=10.0")
     assert (found.verdict.word, found.verdict.margin) == ("asymptotic", "14 more consecutive outages")

@@ -15,7 +15,7 @@ from agv_analysis.stability.chain import chain_of
 from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference import Reference, lap_steps
-from agv_plant.parameters import PlantParameters
+from agv_plant.parameters import ChannelParameters, PlantParameters
 from agv_ros.parameters import SHARED, as_dict
 
 ALONG, ACROSS = "along", "across"
@@ -194,8 +194,8 @@ def left_out(scenario: Scenario) -> tuple[str, ...]:
     on_top = [
         f"relay.{link}.{name} is {value}"
         for link, channel in links.items()
-        for name in ("delay", "jitter", "schedule")
-        if (value := getattr(channel, name))
+        for name in ("delay", "jitter", "lifetime", "schedule")
+        if (value := getattr(channel, name)) != getattr(ChannelParameters(), name)
     ]
     return (*(f"{name} is {values[name]}" for name in found), *on_top)
 

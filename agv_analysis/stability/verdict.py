@@ -8,8 +8,9 @@ The criteria are asked from the strongest statement to the weakest:
 - `bounded`: neither, but the speed is limited, which makes a bounded limit cycle of what would otherwise grow;
 - `unstable`: neither, and nothing bounds the error.
 
-Outages end with a fresh pose; where messages are late none is. A constant delay is judged by the lifted system, any
-other is `unknown`.
+Where commands were lost as well, no sequence of outages is proved to be survived: E[e^2] under both fitted channels
+decides. Outages end with a fresh pose; where messages are late none is. A constant delay is judged by the lifted
+system, any other is `unknown`.
 
 The Floquet multiplier of the run's own sequence of losses stands beside the verdict and does not enter it: it says what
 those losses did to a small error in that one run. Where the mean square grows, most runs may still contract; and a run
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
 UNKNOWN = "unknown"
-"""For a run in which messages were late by more than one constant delay: no criterion here covers it."""
+"""For a run that no criterion here covers."""
 
 
 @dataclass(frozen=True)
@@ -69,3 +70,22 @@ def judge_late(n: int | None, radius: float, v_max: float) -> Verdict:
     if v_max < float("inf"):
         return Verdict(BOUNDED, "v_max", f"{late}; only the limit on the speed bounds it")
     return Verdict(UNSTABLE, "lifted", late)
+
+
+def judge_both_links(growth: float | None, policy: str, v_max: float) -> Verdict:
+    """Verdict on a run in which commands were lost.
+
+    growth: that of E[e^2] (logarithm, per step) under the channels fitted to both links, None if it is not computed for
+    this downlink policy; v_max: limit on the speed [m/s].
+    """
+    if growth is None:
+        return Verdict(
+            UNKNOWN, "none", f"unknown: commands were lost, and no criterion covers downlink policy {policy}"
+        )
+    if growth < 0.0:
+        dies_out = "the mean square of the error dies out" if policy == "hold" else "the error stays bounded on average"
+        return Verdict(MEAN_SQUARE, "both_links", f"commands were lost as well; under both fitted channels {dies_out}")
+    grows = "none: commands were lost as well, and under both fitted channels the mean square grows"
+    if v_max < float("inf"):
+        return Verdict(BOUNDED, "v_max", f"{grows}; only the limit on the speed bounds the error")
+    return Verdict(UNSTABLE, "both_links", grows)
