@@ -11,6 +11,7 @@ from agv_plant.channels.coverage_hole import rows_of as holes
 from agv_plant.channels.installed import TRACE, known_models
 from agv_plant.channels.placed import EVERYWHERE, kind_of
 from agv_plant.channels.schedule import Entry, parse_schedule
+from agv_plant.channels.shared import SCHEDULERS
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.unicycle import STEPS
@@ -107,7 +108,7 @@ class ChannelParameters:
     p: float = parameter(
         0.0,
         "bernoulli: loss probability; coverage_hole: the same outside of the holes; gilbert_elliott: probability of "
-        "good to bad, per slot",
+        "good to bad, per slot; shared: loss probability of a pose that is sent",
         low=0.0,
         high=1.0,
         runtime=True,
@@ -142,6 +143,14 @@ class ChannelParameters:
         20.0, "rayleigh: fade margin; lost where the gain is more than this below its mean", unit="dB", low=-100.0,
         high=300.0, runtime=True,
     )  # fmt: skip
+    vehicles: int = parameter(1, "shared: number of AGVs that share the link", low=1, high=1000)
+    vehicle: int = parameter(0, "shared: which of them this one is, from 0 on", low=0, high=999)
+    blocks: int = parameter(1, "shared: how many of them may send in a slot", low=1, high=1000)
+    scheduler: str = parameter(
+        SCHEDULERS[0],
+        "shared: who may; in turn, those whose pose is the oldest at the edge, or any",
+        choices=SCHEDULERS,
+    )
     trace_file: str = parameter(
         "",
         "trace: CSV file with a row a slot, column lost (0, 1) or verdict (delivered, lost); or JSON, a list so called",
@@ -189,6 +198,10 @@ class ChannelParameters:
         if not holes(self.hole_circles, self.hole_polygons) and self.model == "coverage_hole":
             raise ParameterError(
                 "a channel's model is coverage_hole, but neither hole_circles nor hole_polygons has one"
+            )
+        if self.vehicle >= self.vehicles:
+            raise ParameterError(
+                f"a channel's vehicle is {self.vehicle}, must be 0 to {self.vehicles - 1}: see vehicles"
             )
         _ = self.entries
 

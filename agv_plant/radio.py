@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import functools
 import heapq
 import math
 from collections.abc import Callable, Sequence
@@ -11,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_plant.channels import GOOD
+from agv_plant.channels import GOOD, Model
 from agv_plant.channels.delay import EXPIRED, delays_of, whole_slots
-from agv_plant.channels.installed import TRACE, ChannelError, find_model
+from agv_plant.channels.installed import SHARED, TRACE, ChannelError, find_model
 from agv_plant.channels.placed import NOWHERE, UPLINK, floor_of, kind_of, levels_of, verdict_at
 from agv_plant.channels.schedule import OUTAGE, Segment, is_scripted, segments_of
+from agv_plant.channels.shared import SCHEDULERS, serve, stream_of
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import uniforms
@@ -71,6 +73,31 @@ class _Drawn:
         return self._block[k - first]
 
 
+class _Cell:
+    """The uplink that a fleet shares, as a model that is asked for each slot in turn."""
+
+    def __init__(self, parameters: ChannelParameters, seed: int, link: str) -> None:
+        self._scheduler = SCHEDULERS.index(parameters.scheduler)
+        self._drawn = [
+            _Drawn(functools.partial(uniforms, seed, stream_of(link, vehicle)))
+            for vehicle in range(parameters.vehicles)
+        ]
+        self._ages = [0] * parameters.vehicles
+
+    def __call__(self, channel: ChannelParameters, k: int, _: Sequence[float], state: int) -> tuple[bool, int]:
+        """As any `Model`; what it remembers of the other vehicles begins anew with slot 0."""
+        if k == 0:
+            self._ages = [0] * channel.vehicles
+        turns, fates = zip(*(drawn.at(k)[:2] for drawn in self._drawn), strict=True)
+        lost = [False] * channel.vehicles
+        serve(k, channel.blocks, self._scheduler, channel.p, turns, fates, self._ages, lost)
+        return lost[channel.vehicle], state
+
+
+def _model_of(parameters: ChannelParameters, seed: int, stream: str) -> Model:
+    return _Cell(parameters, seed, stream) if parameters.model == SHARED else find_model(parameters.model)
+
+
 class Channel:
     """Verdicts of one channel, a pure function of (parameters, seed, stream name, k) and, for some, of the place.
 
@@ -87,7 +114,7 @@ class Channel:
         self._kind = kind_of(parameters.model)
         self._floor = floor_of(parameters, seed, stream) if parameters.is_placed else []
         self._trace = load_trace(parameters.trace_file) if measured else ()
-        self._model = None if measured or parameters.is_placed else find_model(parameters.model)
+        self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
         self._random = _Drawn(lambda first, count: draws(self.parameters, seed, stream, first, count))
         self._random_delays = _Drawn(lambda first, count: delay_draws(seed, stream, first, count))
         self._next = 0

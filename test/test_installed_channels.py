@@ -108,7 +108,9 @@ def test_the_commands_know_it(package: Path) -> None:
     assert code == 0, said
     code, said = agv_ncs(package, "channel", "config/outages.yaml", "--set", "relay.uplink.model=rain")
     assert code == 1
-    assert "must be one of " + ", ".join((*MODELS, "trace", *PLACED[1:], "roadworks")) + ", got 'rain'" in said
+    assert (
+        "must be one of " + ", ".join((*MODELS, "trace", *PLACED[1:], "shared", "roadworks")) + ", got 'rain'" in said
+    )
 
 
 @pytest.mark.parametrize(
@@ -132,6 +134,6 @@ def test_a_model_that_cannot_be_used_is_one_line(
 
 
 def test_without_such_packages_the_models_are_those_of_the_page() -> None:
-    assert known_models() == (*MODELS, "trace", *PLACED[1:])
+    assert known_models() == (*MODELS, "trace", *PLACED[1:], "shared")
     page = (REPOSITORY / "docs/channels.md").read_text(encoding="utf-8")
     assert re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE) == list(known_models())

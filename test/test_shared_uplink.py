@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agv_plant.channels.shared import OLDEST_FIRST, RANDOM, ROUND_ROBIN, serve_all
+from agv_analysis.simulation.verdicts import Air
+from agv_plant.channels.shared import OLDEST_FIRST, RANDOM, ROUND_ROBIN, SCHEDULERS, serve_all
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio import Channel, losses
+from agv_ros.parameters import ParameterError
 
 
 def losses_of(vehicles: int, blocks: int, scheduler: int, p: float, slots: int, seed: int = 1) -> NDArray[np.bool_]:
@@ -63,3 +67,28 @@ def test_the_oldest_first_is_never_older_on_average() -> None:
     # age is geometric: its mean is that less one. In turn a pose fails p of the time, and a whole turn is waited for.
     assert random == pytest.approx(12 / (2 * 0.7) - 1.0, rel=0.03)
     assert in_turn == pytest.approx(6.0 * (1.0 + 0.3) / (2.0 * 0.7) - 0.5, rel=0.03)
+
+
+@pytest.mark.parametrize("scheduler", SCHEDULERS)
+def test_every_vehicle_s_relay_works_out_the_same_schedule(scheduler: str) -> None:
+    """In each slot as many are heard as there are blocks, by the relays' own answers; simulated it is the same."""
+    fleet = [ChannelParameters(model="shared", vehicles=5, vehicle=i, blocks=2, scheduler=scheduler) for i in range(5)]
+    lost = np.array([losses(channel, 7, "uplink", 300) for channel in fleet])
+    assert (np.count_nonzero(~lost[:, 1:], axis=0) == 2).all()
+    assert (lost == [Air(7, 300).verdicts(channel, "uplink") for channel in fleet]).all()
+
+
+def test_a_lossy_cell_with_a_schedule_is_the_same_simulated() -> None:
+    channel = ChannelParameters(
+        model="shared", vehicles=4, vehicle=3, blocks=2, scheduler="oldest_first", p=0.3, schedule="0.5: p=0.9"
+    )
+    lost = losses(channel, 3, "uplink", 400)
+    assert lost[100:].mean() > lost[:100].mean()
+    assert (lost == Air(3, 400).verdicts(channel, "uplink")).all()
+    anew = Channel(channel, 3, "uplink")
+    assert [anew.lost(k) for k in (250, 10, 11, 399)] == [lost[k] for k in (250, 10, 11, 399)]
+
+
+def test_a_vehicle_that_is_not_there() -> None:
+    with pytest.raises(ParameterError, match="must be 0 to 3"):
+        ChannelParameters(model="shared", vehicles=4, vehicle=4)

@@ -21,11 +21,13 @@ from agv_analysis.simulation.chance import normals
 from agv_analysis.simulation.on_air import Way
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.delay import NEVER, delays_of, soonest
-from agv_plant.channels.installed import TRACE, find_model
+from agv_plant.channels.installed import SHARED, TRACE, find_model
 from agv_plant.channels.placed import floor_of, kind_of, levels_of
 from agv_plant.channels.schedule import Segment, is_scripted, segments_of
+from agv_plant.channels.shared import SCHEDULERS, serve_all, stream_of
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import delay_draws, draws, losses
+from agv_plant.random_stream import uniforms
 from agv_ros.parameters import LoopParameters
 
 Verdicts = NDArray[np.bool_]
@@ -66,7 +68,9 @@ class Air:
         if channel.model == TRACE:  # nothing to compute
             return losses(channel, self._seed, stream, self._steps, self._ts)
         lost = np.zeros(self._steps, dtype=np.bool_)
-        if channel.model != "perfect" and not channel.is_placed:
+        if channel.model == SHARED:
+            self._serve(channel, stream, lost)
+        elif channel.model != "perfect" and not channel.is_placed:
             try:
                 self._ask(channel, stream, lost)
             except Exception:
@@ -81,6 +85,28 @@ class Air:
                 lost[segment.first : end] |= _slots_under_way(segment, end, self._seed, stream, self._ts) == NEVER
         lost[0] = False  # slot 0 never is
         return lost
+
+    def _serve(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
+        """Work out what becomes of the whole fleet."""
+        streams = [stream_of(stream, vehicle) for vehicle in range(channel.vehicles)]
+        turns, fates = np.stack(
+            [uniforms(self._seed, name, 0, self._steps)[:, :2] for name in streams], axis=2
+        ).swapaxes(0, 1)
+        ages, scheduler = np.zeros(channel.vehicles, dtype=np.int64), SCHEDULERS.index(channel.scheduler)
+        of_all = np.zeros((self._steps, channel.vehicles), dtype=np.bool_)
+        for segment, end in _segments(channel, self._steps, self._ts):
+            part = slice(segment.first, end)
+            compiled(serve_all)(
+                segment.first,
+                channel.blocks,
+                scheduler,
+                segment.channel.p,
+                turns[part],
+                fates[part],
+                ages,
+                of_all[part],
+            )
+        lost[:] = of_all[:, channel.vehicle]
 
     def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
         """Ask the channel's model, slot by slot."""

@@ -2,9 +2,9 @@
 
 One module a model. Each is a scalar function of its parameters, of the slot's uniform random numbers and, where the
 channel has a memory, of its state before the slot; the function also gives the state after it. `MODELS` names them all,
-but for `trace`, whose verdicts were measured and stand in a file, those that ask where the AGV is (`placed`), and those
-of other packages (`installed`). On top of any of them messages may be late (`delay`), and a schedule may change what a
-channel does while a run goes on (`schedule`).
+but for `trace`, whose verdicts were measured and stand in a file, those that ask where the AGV is (`placed`), `shared`,
+in which the messages of a fleet compete, and those of other packages (`installed`). On top of any of them messages may
+be late (`delay`), and a schedule may change what a channel does while a run goes on (`schedule`).
 """
 
 from __future__ import annotations

@@ -14,6 +14,9 @@ GROUP = "agv_ncs.channels"
 TRACE = "trace"
 """The model whose verdicts stand in a file."""
 
+SHARED = "shared"
+"""The model whose verdicts depend on what became of other vehicles' messages."""
+
 
 class ChannelError(UserError):
     """A channel model that cannot be used; the text names it and the reason."""
@@ -29,19 +32,19 @@ def _installed() -> dict[str, tuple[EntryPoint, ...]]:
 
 def known_models() -> tuple[str, ...]:
     """Names of all models: those of this package, then those of other installed ones."""
-    own = (*MODELS, TRACE, *PLACED[1:])
+    own = (*MODELS, TRACE, *PLACED[1:], SHARED)
     return (*own, *(name for name in _installed() if name not in own))
 
 
 @functools.cache
 def find_model(name: str) -> Model:
-    """The model called `name`, which is one of `known_models` but neither `trace` nor one of `PLACED`.
+    """The model called `name`, which is one of `known_models` but neither `trace`, `shared` nor one of `PLACED`.
 
     Raises ChannelError if two models have this name or if another package's model cannot be imported.
     """
     points = _installed().get(name, ())
     sources = [f"{point.value} of another package" for point in points]
-    if name in (*MODELS, TRACE, *PLACED):
+    if name in (*MODELS, TRACE, SHARED, *PLACED):
         sources.insert(0, "that of agv_ncs")
     if len(sources) > 1:
         raise ChannelError(f"two channel models are called {name}: {' and '.join(sources)}; rename one")

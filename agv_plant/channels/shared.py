@@ -14,8 +14,14 @@ vehicles' relays work out the same schedule from the same seed, so none has to t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+
+Numbers = NDArray[np.float64] | Sequence[float]
+Ages = NDArray[np.int64] | list[int]
+Flags = NDArray[np.bool_] | list[bool]
 
 ROUND_ROBIN, OLDEST_FIRST, RANDOM = range(3)
 
@@ -26,10 +32,14 @@ _FIRST = -1.0
 """Comes before every number that a turn can be."""
 
 
+def stream_of(link: str, vehicle: int) -> str:
+    """Name of the stream of a vehicle's random numbers: the first for its turn, the second for its loss."""
+    return f"{link}/vehicle {vehicle}"
+
+
 def serve(
-    k: int, blocks: int, scheduler: int, p: float, u_turn: NDArray[np.float64], u_loss: NDArray[np.float64],
-    ages: NDArray[np.int64], lost: NDArray[np.bool_],
-) -> None:  # fmt: skip
+    k: int, blocks: int, scheduler: int, p: float, u_turn: Numbers, u_loss: Numbers, ages: Ages, lost: Flags
+) -> None:
     """Slot k: whose pose is lost, into `lost`, and how old each is now at the edge, in `ages`; all of shape (N,).
 
     `u_turn` and `u_loss` are each vehicle's numbers of this slot, uniform in [0, 1).
