@@ -71,6 +71,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             self.get_logger().info("tf2_msgs is not installed: no node of this loop publishes transforms on /tf")
         self._is_odometry = self.settings.pose_type == ODOMETRY
         self._freshest = FreshestPose(self.grid.ts_ns)
+        self._timer: Any = None
         self._missed = 0
         self._oldest_ns = 0
         kind = Odometry if self._is_odometry else PoseStamped
@@ -79,8 +80,6 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             self.input(kind, "edge/pose", self._keep_pose, self._error_out)
             # Not used; but a relay, if there is one, may be told to wait until somebody hears its slots.
             self.input(TimeReference, "edge/slot", lambda _: None)
-            is_simulated = bool(self.get_parameter("use_sim_time").value)
-            self.create_timer(self.settings.ts, self._tick, clock=self.get_clock() if is_simulated else self._steady)
         else:
             self.input(kind, "edge/pose", self._on_pose, self._error_out)
             self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
@@ -169,16 +168,25 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
                 f"the first pose has the stamp {first_ns / NS_PER_S:.3f} s, which is in no run that begins at "
                 f"start_time = {self.settings.start_time:g} s: set it, or set error_detector.begin to first_pose"
             )
+            return
         self._steps = Steps(self.grid)
         self._prediction = self._new_prediction()
         self._answered = -1
+        # From here on, so that its ticks come just after the AGV's instants: a command must not be from the future.
+        if self._timer is None:
+            is_simulated = bool(self.get_parameter("use_sim_time").value)
+            clock = self.get_clock() if is_simulated else self._steady
+            self._timer = self.create_timer(self.settings.ts, self._tick, clock=clock)
+        else:
+            self._timer.reset()
+        self._tick()
 
     def _tick(self) -> None:
         pose = self._freshest.pose
         if pose is None or self.finished:
             return
         time_ns = self._freshest.time(self.get_clock().now().nanoseconds)
-        k = self._nearest_step(time_ns)
+        k = self._step_at(time_ns, self.grid.ts_ns // 100)
         if k <= self._answered:
             return
         self._missed += k - self._answered - 1 if self._answered >= 0 else 0
@@ -186,10 +194,11 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._oldest_ns = max(self._oldest_ns, stamp_ns - pose.stamp_ns)
         self.report_every_second(stamp_ns)
         self._age_out.publish(encode_slot(Slot(stamp_ns, pose.stamp_ns, TIMER)))
-        self._compare(k, min(k, self._nearest_step(pose.stamp_ns)), pose)
+        self._compare(k, min(k, self._step_at(pose.stamp_ns, self.grid.ts_ns // 2)), pose)
 
-    def _nearest_step(self, stamp_ns: int) -> int:
-        return max(0, (stamp_ns - self.grid.start_ns + self.grid.ts_ns // 2) // self.grid.ts_ns)
+    def _step_at(self, stamp_ns: int, early_ns: int) -> int:
+        """The last step at an instant; one that is only `early_ns` ahead counts."""
+        return max(0, (stamp_ns - self.grid.start_ns + early_ns) // self.grid.ts_ns)
 
     # -- either way --------------------------------------------------------------------------------------------------
 
