@@ -543,9 +543,16 @@ def test_a_waiting_node_ends_cleanly_on_signals(
     [((), "relay"), (("relay",), "error_detector"), (("relay", "error_detector"), "controller")],
 )
 def test_lockstep_names_the_missing_peer(start: Start, running: tuple[str, ...], silent: str) -> None:
-    modules = {"relay": "agv_plant.relay_node", "error_detector": "agv_cloud.error_detector_node"}
+    peers = {
+        "relay": ("agv_plant.relay_node", "edge/slot"),
+        "error_detector": ("agv_cloud.error_detector_node", "edge/error"),
+    }
+    onlooker = Bench("events")
     for name in running:
-        start(modules[name])
+        module, topic = peers[name]
+        start(module)
+        onlooker.until(functools.partial(onlooker.probe.count_publishers, topic))
+    onlooker.close()
     plant = start("agv_plant.plant_node", "--ros-args", "-p", "answer_timeout:=2.0")
     status, said = plant.end()
     assert status == 1
