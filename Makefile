@@ -25,7 +25,7 @@ test: $(VENV)/test.stamp ## style, types and tests
 	$(BIN)/mypy
 	$(BIN)/python -m pytest $(PLUGINS) -n auto --dist worksteal $(PYTEST_ARGS)
 
-coverage: $(VENV)/test.stamp ## the tests, half as fast, with the lines and branches that they reach
+coverage: $(VENV)/test.stamp ## the tests, with the lines and branches that they reach
 	$(BIN)/python -m pytest $(PLUGINS) -p pytest_cov -n auto --dist worksteal --cov --cov-report=term $(PYTEST_ARGS)
 
 bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from agv_plant.channels.coverage_hole import NO_HOLES
 from agv_plant.channels.coverage_hole import rows_of as holes
-from agv_plant.channels.installed import TRACE, known_models
+from agv_plant.channels.installed import SHARED, TRACE, known_models
 from agv_plant.channels.placed import EVERYWHERE, kind_of
 from agv_plant.channels.schedule import Entry, parse_schedule
 from agv_plant.channels.shared import SCHEDULERS
@@ -199,7 +199,7 @@ class ChannelParameters:
             raise ParameterError(
                 "a channel's model is coverage_hole, but neither hole_circles nor hole_polygons has one"
             )
-        if self.vehicle >= self.vehicles:
+        if self.model == SHARED and self.vehicle >= self.vehicles:
             raise ParameterError(
                 f"a channel's vehicle is {self.vehicle}, must be 0 to {self.vehicles - 1}: see vehicles"
             )

@@ -43,8 +43,12 @@ from agv_ros.wire import (
     stamp_of,
 )
 
-_REPEAT_AFTER = 0.5
-"""Lockstep: a pose is sent again after this time [s] without an answer, if a peer may have come up after it."""
+_REPEAT_AFTER, _REPEAT_AFTER_WAITING = 0.5, 4.0
+"""Lockstep: a pose is sent again after this time [s] without an answer, if a peer may have come up after it.
+
+Later where this node has waited for subscribers, who may yet have been others than its peers: a busy machine alone
+shall not make a run differ, and what DDS itself has lost it brings after 3 s.
+"""
 
 _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_vel", "controller"))
 """A topic that each peer publishes, in the order in which a step passes them."""
@@ -197,6 +201,7 @@ class PlantNode(LoopNode[PlantParameters]):
     def _watch_for_answers(self) -> None:
         """Give up, naming the missing peer, when a step stays without an answer for too long."""
         seen, since, repeated, known = -1, time.monotonic(), time.monotonic(), self._peers()
+        patience = _REPEAT_AFTER_WAITING if self.settings.wait_for_subscribers else _REPEAT_AFTER
 
         def watch() -> None:
             nonlocal seen, since, repeated, known
@@ -207,7 +212,7 @@ class PlantNode(LoopNode[PlantParameters]):
                 seen, since = self.k, now
             elif now - since > self.settings.answer_timeout:
                 self.fail(self._no_answer())
-            elif now - max(since, repeated) > _REPEAT_AFTER and self._pose_out.count and self._may_be_lost(known):
+            elif now - max(since, repeated) > patience and self._pose_out.count and self._may_be_lost(known):
                 repeated = now
                 self._pose_out.publish(encode_pose(self._measured_pose()))
 
@@ -222,14 +227,9 @@ class PlantNode(LoopNode[PlantParameters]):
         )
 
     def _may_be_lost(self, known: frozenset[tuple[str, bytes]]) -> bool:
-        """May the pose of this step have come before a peer was up, be it at the start or started again?
-
-        Not at the start if this node has waited for its peers: then a machine is busy, and step 0 is sent once.
-        """
-        if self.k == 0 and self.settings.wait_for_subscribers == 0:
-            return True
+        """May the pose of this step have come before a peer was up, be it at the start or started again?"""
         peers = self._peers()
-        return bool(peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
+        return self.k == 0 or bool(peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 
     def _no_answer(self) -> str:
         silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)

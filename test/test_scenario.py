@@ -132,6 +132,8 @@ def scenarios(draw: st.DrawFn) -> Scenario:
     for link in ("uplink", "downlink"):
         if lines["relay"].get(f"{link}.model") == "trace":
             lines["relay"][f"{link}.trace_file"] = "outages.csv"  # a trace needs one
+        if lines["relay"].get(f"{link}.model") == "shared":
+            lines["relay"][f"{link}.vehicles"] = 1000
         if lines["relay"].get(f"{link}.model") == "coverage_hole":
             lines["relay"][f"{link}.hole_circles"] = (0.0, 0.0, 1.0)
     nodes = {node: _build(schema, lines[node]) for node, schema in SCHEMAS.items()}

@@ -109,7 +109,7 @@ def test_whoever_listens_gets_both_frames(of_another_type: None, prefix: str) ->
     from agv_ros.executor import EXECUTORS, spin_for
     from agv_ros.node import LOOP_QOS
 
-    settings = (f"plant.frame_prefix={prefix}", "plant.duration=.inf", "plant.wait_for_subscribers=1")
+    settings = (f"plant.frame_prefix={prefix}", "plant.duration=.inf")
     scenario = load_scenario(str(REPOSITORY / "config/outages.yaml"), settings)
     transforms: dict[str, dict[int, Any]] = {f"{prefix}base_link": {}, f"{prefix}reference": {}}
     sent: dict[int, Pose] = {}
