@@ -1,4 +1,4 @@
-"""Speed of the stability criteria: eigenvalue tests of A(k), and a pose that is always 500 steps old.
+"""Speed of the stability criteria: eigenvalue tests of A(k), a pose that is always 500 steps old, a map of margins.
 
 The peers are what a person would write instead: numpy's eigenvalues of each matrix in a Python loop, of all matrices in
 one call, and of the lifted system's dense block companion matrix.
@@ -6,6 +6,7 @@ one call, and of the lifted system's dense block companion matrix.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -14,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.run import Floats
-from agv_analysis.scenario import load_scenario
+from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.stability import lifted, paper
 from agv_analysis.stability.linearisation import step_matrices
+from agv_analysis.stability.margin_map import around, margin_map
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference import Reference
 from benchmarks.comparison import Comparison
@@ -26,6 +28,8 @@ STEPS = 20_000
 HELD = 10
 """n_ul in the eigenvalue tests."""
 N = 500
+POINTS = 100
+"""Points of each axis of the map."""
 
 
 def measure() -> list[Comparison]:
@@ -40,6 +44,9 @@ def measure() -> list[Comparison]:
     batched = _seconds(3, lambda: _all_at_once(theta, theta_held, v_held, gains, ts))
     of_lifted = _seconds(5, lambda: lifted.spectral_radius(N, 1.0, 0.1, gains, ts))
     of_companion = _seconds(1, lambda: companion_radius(N, 1.0, 0.1, gains, ts))
+    base, axes = around(scenario, ("kx", "ts"), POINTS)
+    of_map = _seconds(3, lambda: margin_map(base, ("kx", "ts"), *axes))
+    one_by_one = _seconds(1, lambda: [_largest_n(scenario, kx) for kx in axes[0].tolist()]) * POINTS
     what, tests = "20 000 eigenvalue tests of A(k)", "tests/s"
     return [
         Comparison(what, STEPS / ours, "Python loop over numpy", STEPS / loop, tests, 20.0),
@@ -48,7 +55,17 @@ def measure() -> list[Comparison]:
             f"constant n = {N}", of_lifted, f"dense {3 * (N + 1)} x {3 * (N + 1)}", of_companion, "s",
             smaller_is_better=True,
         ),
+        Comparison(
+            f"map of {POINTS} x {POINTS} points", of_map, f"constant n alone, point by point ({POINTS} of them)",
+            one_by_one, "s", smaller_is_better=True,
+        ),
     ]  # fmt: skip
+
+
+def _largest_n(scenario: Scenario, kx: float) -> int | None:
+    """Largest constant n at one point of the map, by bisection."""
+    gains = dataclasses.replace(scenario.controller, kx=kx)
+    return lifted.largest_n(np.ones(1), np.zeros(1), gains, scenario.plant.ts)
 
 
 def _seconds(tries: int, work: Callable[[], object]) -> float:
