@@ -282,6 +282,19 @@ def test_the_sentence_says_how_it_is(lap: Analysis) -> None:
 
 
 @pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (("relay.downlink.p=0.3",), "on radio links like these, which lose commands as well"),
+        (("relay.downlink.p=0.98",), "does not keep to its track: losses on both links, of poses and of commands, are"),
+        (("relay.downlink.p=0.3", "plant.downlink_policy=ramp"), "no criterion covers downlink policy ramp"),
+    ],
+)
+def test_the_sentence_does_not_blame_the_uplink_for_the_downlink(settings: tuple[str, ...], said: str) -> None:
+    lossy = ("relay.uplink.model=perfect", "relay.downlink.model=bernoulli", "error_detector.track=line")
+    assert said in sentence(analyse(simulate(scenario_of(*lossy, *settings))))
+
+
+@pytest.mark.parametrize(
     ("delay", "expected"),
     [
         (0.06, "The AGV keeps to its track with poses up to 12 steps (60 ms) old."),

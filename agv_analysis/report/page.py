@@ -39,6 +39,10 @@ def sentence(analysis: Observations) -> str:
     if not isinstance(analysis, Analysis):
         return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
     word, met = analysis.verdict.word, _met(analysis)
+    if word == MEAN_SQUARE and analysis.run.downlink_lost.any():
+        return (
+            "The AGV keeps to its track on radio links like these, which lose commands as well, but not in every case."
+        )
     if word == ASYMPTOTIC and analysis.n == 0:
         return "The AGV keeps to its track; no update was lost."
     if word == ASYMPTOTIC and _is_late(analysis):
@@ -51,7 +55,7 @@ def sentence(analysis: Observations) -> str:
             "would throw it off."
         )
     if word == UNKNOWN:
-        return "Whether the loop is stable cannot be said: messages were late, which the criteria do not cover."
+        return f"Whether the loop is stable cannot be said: {analysis.verdict.margin.removeprefix('unknown: ')}."
     if word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
     return f"The AGV does not keep to its track: {met} are too much for these gains."
@@ -67,6 +71,8 @@ def _met(analysis: Observations) -> str:
     age = f"{analysis.n * analysis.run.ts * 1e3:g} ms"
     if _is_late(analysis):
         return f"poses up to {analysis.n} steps ({age}) old"
+    if analysis.run.downlink_lost.any():
+        return "losses on both links, of poses and of commands,"
     return f"outages of {analysis.n} lost updates in a row ({age})"
 
 
