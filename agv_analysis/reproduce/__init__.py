@@ -3,7 +3,7 @@
 S. Tayade, P. Rost, A. Maeder, Error Convergence Analysis and Stability of a Cloud Control AGV.
 
     runs       the paper's scenario, simulated or driven by the nodes and read from their bags
-    outdated   the loop with a pose that is always n steps old, which no channel of the relay makes
+    outdated   the loop with a pose that is always n steps old, by a delay
     figures    the paper's figures, with their data as CSV
     claim      what a claim is, and what came out of it
     claims     the claims of the paper's text: how each is measured and judged

@@ -1,23 +1,19 @@
-"""The loop with a pose that is always n steps old.
+"""The loop with a pose that is always n steps old, as a relay that delays each pose makes it.
 
-Outages make the age n_ul a sawtooth; the lifted system asks for a constant one, which no channel of the relay makes.
-Here it is simulated, by the same functions of a slot.
+Outages make the age n_ul a sawtooth; the lifted system asks for a constant one.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import TWIN_OFFSET
-from agv_analysis.simulation.loop import Loop, Rows, Settings, answer, at_rest, goes_on, obey, received
-from agv_analysis.simulation.single import settings_of, steps_of
+from agv_analysis.simulation.single import simulate, steps_of
 from agv_cloud.reference import Reference
+from agv_plant.parameters import ChannelParameters
 
 
 def poses(scenario: Scenario, n: int, offset: float = 0.0) -> Floats:
@@ -26,10 +22,11 @@ def poses(scenario: Scenario, n: int, offset: float = 0.0) -> Floats:
     The AGV starts `offset` [m, m, rad] away from the scenario's initial pose. Fewer rows than steps if the loop left
     the range of numbers.
     """
-    reference = Reference(scenario.error_detector).first(steps_of(scenario))
-    rows = np.empty((len(reference), 3))
-    start = at_rest(*(value + offset for value in scenario.plant.initial_pose))
-    return rows[: compiled(drive)(numbers(reference), start, settings_of(scenario), n, rows)]
+    late = ChannelParameters(delay=n * scenario.plant.ts)
+    x, y, theta = (value + offset for value in scenario.plant.initial_pose)
+    plant = dataclasses.replace(scenario.plant, initial_pose=(x, y, theta))
+    relay = dataclasses.replace(scenario.relay, uplink=late, downlink=ChannelParameters())
+    return simulate(dataclasses.replace(scenario, plant=plant, relay=relay)).pose
 
 
 def final_error(scenario: Scenario, n: int) -> float:
@@ -49,20 +46,3 @@ def contraction(scenario: Scenario, n: int) -> float:
         return math.inf
     apart = [math.hypot(*moved) for moved in (twin - run).tolist()]
     return max(apart[-max(1, len(apart) // 100) :]) / apart[0]
-
-
-def drive(reference: Rows, start: Loop, settings: Settings, n: int, rows: NDArray[np.float64]) -> int:
-    """One run, written down: X_c(k) into rows[k]; returns the number of slots until it ended."""
-    loop = start
-    for k in range(len(reference)):
-        x_r, y_r, theta_r, v_r, w_r = reference[k]
-        rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
-        then = max(0, k - n)
-        x, y, theta = rows[then]
-        x_then, y_then, theta_then, _, _ = reference[then]
-        held = received(loop, x, y, theta, x_then, y_then, theta_then, k - then)
-        sent = answer(held, x_r, y_r, theta_r, v_r, w_r, settings)
-        loop = obey(held, sent, False, 0.0, 0.0, v_r, w_r, settings)
-        if not goes_on(loop, sent):
-            return k + 1
-    return len(reference)
