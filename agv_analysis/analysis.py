@@ -10,7 +10,7 @@ import numpy as np
 from agv_analysis.channel_fit import ChannelFit, fit_channel
 from agv_analysis.convergence import Convergence, convergence
 from agv_analysis.outages import Outages, loss_causes, outages
-from agv_analysis.run import Floats, Run
+from agv_analysis.run import Floats, LinkSlots, Run
 from agv_analysis.stability import both_links, bursts, floquet, late, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict
 from agv_analysis.stability.linearisation import Edge
@@ -196,14 +196,14 @@ def analyse(run: Run) -> Analysis:
     both = _growth_on_both_links(run, fit, edge)
     growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain, edge=edge) / len(run) if both is None else both
     of_drops, of_motion = _contractions(run, edge)
-    longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
-    n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
     radius = _lifted_radius(out.n_ul_max, v_r, w_r, run, edge)
     if _is_late(run):
         verdict = judge_late(_constant_delay(run), radius, gains.v_max)
     elif run.downlink_lost.any():
         verdict = judge_both_links(both, run.scenario.plant.downlink_policy, gains.v_max)
     else:
+        longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
+        n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
         verdict = judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max)
     return Analysis(
         run=run,
@@ -235,13 +235,17 @@ def _growth_on_both_links(run: Run, fit: ChannelFit, edge: Edge) -> float | None
 
 def _is_late(run: Run) -> bool:
     """Did messages arrive in a later slot than their own?"""
-    return any(link is not None and bool(link.delay.any()) for link in (run.uplink, run.downlink))
+    return _has_late(run.uplink) or _has_late(run.downlink)
+
+
+def _has_late(link: LinkSlots | None) -> bool:
+    return link is not None and bool(link.delay.any())
 
 
 def _constant_delay(run: Run) -> int | None:
     """Age of the pose in slots, if it is always the same, but for the beginning, and commands are there at once."""
     n = int(run.n_ul.max())
-    is_direct = not run.downlink_lost.any() and (run.downlink is None or not run.downlink.delay.any())
+    is_direct = not (run.downlink_lost.any() or _has_late(run.downlink))
     return n if is_direct and np.array_equal(run.n_ul, np.minimum(run.k, n)) else None
 
 
@@ -283,7 +287,7 @@ def _contractions(run: Run, edge: Edge) -> tuple[float | None, float | None]:
 def _late_contraction(run: Run, edge: Edge) -> float | None:
     """Growth factor per step about the reference from the first step on; None for what `late` does not know."""
     is_whole = run.k[0] == 0 and int(run.k[-1]) + 1 == len(run)
-    if edge.predicts or not is_whole or (run.downlink is not None and run.downlink.delay.any()):
+    if edge.predicts or not is_whole or _has_late(run.downlink):
         return None
     with np.errstate(all="ignore"):
         growth = late.age_sequence(

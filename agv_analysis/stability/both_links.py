@@ -27,12 +27,11 @@ from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.chain import Chain
 from agv_analysis.stability.linearisation import HELD, Edge, is_constant, reachable, seen, step_matrices
+from agv_analysis.stability.mean_square import settled_growth
 from agv_cloud.parameters import ControllerParameters
 
 POLICIES = ("hold", "zero")
 """Downlink policies that are a Markov jump linear system of three errors; others remember more."""
-
-_LAPS = 40
 
 _MOST_STATES = 4
 """Joint states of the channels, at most, of which the whole recursion is made a matrix."""
@@ -58,17 +57,11 @@ def lap_growth(
     if is_constant(v_r, w_r) and len(transition) <= _MOST_STATES:
         return len(v_r) * math.log(np.abs(np.linalg.eigvals(operator(maps[0], transition, probabilities))).max())
     moments = np.array(np.broadcast_to(np.eye(3 * size), (len(transition), 3 * size, 3 * size)))
-    growth = math.nan
-    for _ in range(_LAPS):
-        log_scale = compiled(_drive_lap)(maps, transition, probabilities, moments)
-        size_now = float(np.trace(moments, axis1=1, axis2=2).sum())
-        if not size_now > 0.0:
-            return -math.inf
-        moments /= size_now
-        before, growth = growth, log_scale + math.log(size_now)
-        if abs(growth - before) <= 1e-8 * max(1.0, abs(growth)):
-            break
-    return growth
+    return settled_growth(
+        moments,
+        lambda: float(compiled(_drive_lap)(maps, transition, probabilities, moments)),
+        lambda: float(np.trace(moments, axis1=1, axis2=2).sum()),
+    )
 
 
 def step_maps(F: Floats, G: Floats, H: Floats | None, pose: bool, command: bool, stops: bool) -> Floats:

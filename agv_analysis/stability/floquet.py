@@ -181,8 +181,7 @@ def trajectory(
     """As `drop_sequence`, linearised about the motion that was driven instead of about the reference.
 
     X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`; the policy is `hold` or, with `align`,
-    that. The growths are those of a displacement
-    of the whole run, in [m, m, rad] of the map.
+    that. The growths are those of a displacement of the whole run, in [m, m, rad] of the map.
     """
     age = np.arange(len(lost)) - np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
     taken = np.arange(len(lost)) - age

@@ -77,14 +77,27 @@ def lap_growth(
     if moments is None:
         moments = unit_moments(len(chain.delivery))
     moments = moments[:, :, :size, :size]
+    growth = settled_growth(
+        moments,
+        lambda: float(compiled(_drive_lap)(F, G, H, chain.transition, chain.delivery, moments)),
+        lambda: float(np.trace(moments[0] + moments[2], axis1=1, axis2=2).sum()),
+    )
+    if growth == -math.inf:  # a predictor leaves nothing of the error but rounding
+        moments[:] = np.eye(size)
+    return growth
+
+
+def settled_growth(moments: Floats, drive_lap: Callable[[], float], size: Callable[[], float]) -> float:
+    """Growth (logarithm) of second moments over a lap, by driving laps until it settles; -inf if nothing is left.
+
+    `drive_lap` sends them through a lap in place, to be multiplied by exp(what it returns); `size` is theirs.
+    """
     growth = math.nan
     for _ in range(_LAPS):
-        log_scale = compiled(_drive_lap)(F, G, H, chain.transition, chain.delivery, moments)
-        # From one lap to the next the moments keep their proportions in the end, so their size says it all.
-        size_now = float(np.trace(moments[0] + moments[2], axis1=1, axis2=2).sum())
-        if not size_now > 0.0:  # a predictor leaves nothing of the error but rounding
-            moments[:] = np.eye(size)
+        log_scale, size_now = drive_lap(), size()
+        if not size_now > 0.0:
             return -math.inf
+        # From one lap to the next the moments keep their proportions in the end, so their size says it all.
         moments /= size_now
         before, growth = growth, log_scale + math.log(size_now)
         if abs(growth - before) <= 1e-8 * max(1.0, abs(growth)):
