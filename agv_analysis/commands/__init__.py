@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,6 +23,21 @@ def with_settings(command: F) -> F:
         help="Change a parameter of the file, as in --set relay.uplink.p=0.05. May be repeated.",
     )(command)  # fmt: skip
     return click.argument("params", type=click.Path())(command)
+
+
+@contextmanager
+def needs_ros(otherwise: str = "") -> Iterator[None]:
+    """Where something is imported that needs ROS 2: without it the command ends with a line that says so.
+
+    `otherwise` goes to its end: what can be had all the same.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise click.ClickException(
+            f"the loop runs on ROS 2, which is not to be found here ({error}): source your ROS 2 installation, "
+            f"or `pip install 'agv_ncs[ros]'`{otherwise}"
+        ) from None
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -8,17 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import write_json
+from agv_analysis.commands import needs_ros, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.replay import Comparison, Difference
     from agv_analysis.run import Run
     from agv_analysis.scenario import Scenario
-
-_NO_ROS = (
-    "this runs on ROS 2, which is not to be found here ({}): source your ROS 2 installation, or "
-    "`pip install 'agv_ncs[ros]'`; --compare and --again alone need none"
-)
 
 
 @click.command("replay")
@@ -85,10 +80,8 @@ def _check(is_wrong: bool, text: str) -> None:
 
 
 def _runner() -> Any:
-    try:
+    with needs_ros("; --compare and --again alone need none"):
         from agv_analysis import runner
-    except ImportError as error:
-        raise click.ClickException(_NO_ROS.format(error)) from None
     return runner
 
 

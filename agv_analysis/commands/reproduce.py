@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from agv_analysis.commands import needs_ros
+
 if TYPE_CHECKING:
     from agv_analysis.reproduce.runs import Runs
 
@@ -59,10 +61,5 @@ def _runs(out: Path, ros: bool) -> Runs:
 
     if not ros:
         return simulated()
-    try:
+    with needs_ros():
         return recorded(out / "bags")
-    except ImportError as error:
-        raise click.ClickException(
-            f"the loop runs on ROS 2, which is not to be found here ({error}): source your ROS 2 installation, "
-            "or `pip install 'agv_ncs[ros]'`"
-        ) from None

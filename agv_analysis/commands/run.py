@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from agv_analysis.commands import with_settings
+from agv_analysis.commands import needs_ros, with_settings
 
 
 @click.command("run")
@@ -38,13 +38,8 @@ def command(
     shorthands = {"plant.clock": clock, "plant.duration": duration, "relay.seed": seed, "plant.seed": seed}
     given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
     scenario = load_scenario(params, (*settings, *given))
-    try:
+    with needs_ros():
         from agv_analysis import runner
-    except ImportError as error:
-        raise click.ClickException(
-            f"the loop runs on ROS 2, which is not to be found here ({error}): source your ROS 2 installation, "
-            "or `pip install 'agv_ncs[ros]'`"
-        ) from None
     from agv_analysis.progress import step_bar
 
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
