@@ -25,8 +25,8 @@ from agv_analysis.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version
 from agv_ros.executor import run_node
-from agv_ros.node import ENDED, PUBLISHED, LoopNode
-from agv_ros.wire import stamp_of
+from agv_ros.node import ENDED, LoopNode
+from agv_ros.wire import PUBLISHED, stamp_of
 
 TOPICS: dict[str, type] = {
     "/clock": Clock,
@@ -61,8 +61,8 @@ class RecorderNode(LoopNode[RecorderParameters]):
         self._running: set[str] = set()
         agv, edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
         everywhere = [agv] if edge is agv else [agv, edge]
-        sides = [[edge] if topic.startswith("edge/") else [agv] for topic in TOPICS]
-        sides[list(TOPICS).index("/diagnostics")] = everywhere
+        one = {topic: [edge] if topic.startswith("edge/") else [agv] for topic in TOPICS}
+        sides = [*(one | {"/diagnostics": everywhere}).values()]
         self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
         describe = [
             self._describer(topic, kind, where)

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_ros.stamps import NS_PER_S, Grid
+from agv_ros.wire import PUBLISHED
 
 TOPIC = "/diagnostics"
 
-_REPORTS = f"published {TOPIC}".encode()
+_REPORTS = f"{PUBLISHED}{TOPIC}".encode()
 """Key of a node's count of its own reports, which begins anew with each process."""
 
 

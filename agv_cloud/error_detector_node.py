@@ -5,7 +5,6 @@ It steps with each slot that the relay announces, lost or not; or, behind a real
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -43,6 +42,7 @@ from agv_ros.wire import (
     decode_slot,
     encode_error,
     encode_slot,
+    quaternion_of_yaw,
     stamp_of,
 )
 
@@ -97,7 +97,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             pose = PoseStamped()
             pose.header.frame_id = FRAME_MAP
             pose.pose.position.x, pose.pose.position.y = point.x, point.y
-            pose.pose.orientation.z, pose.pose.orientation.w = math.sin(0.5 * point.theta), math.cos(0.5 * point.theta)
+            pose.pose.orientation.z, pose.pose.orientation.w = quaternion_of_yaw(point.theta)
             path.poses.append(pose)
         self._path_out.publish(path)
 

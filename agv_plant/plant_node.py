@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from rosgraph_msgs.msg import Clock
@@ -23,7 +23,7 @@ from agv_plant.held_command import HeldCommand
 from agv_plant.motion import NOISE, SLIP, Motion, body_of, measured, move
 from agv_plant.parameters import PlantParameters
 from agv_plant.punctuality import Punctuality
-from agv_plant.random_stream import Normals
+from agv_plant.random_stream import normals_of
 from agv_plant.unicycle import State
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
@@ -42,6 +42,8 @@ from agv_ros.wire import (
     encode_pose,
     stamp_of,
 )
+
+D = TypeVar("D")
 
 _REPEAT_AFTER, _REPEAT_AFTER_WAITING = 0.5, 4.0
 """Lockstep: a pose is sent again after this time [s] without an answer, if a peer may have come up after it.
@@ -76,8 +78,8 @@ class PlantNode(LoopNode[PlantParameters]):
         self._steps_per_line = max(1, round(self.steps / 20 if math.isfinite(self.steps) else 10.0 / settings.ts))
         self._motion = Motion(*settings.initial_pose)
         self._body = body_of(settings)
-        self._noise = Normals(settings.seed, NOISE)
-        self._slip = Normals(settings.seed, SLIP)
+        self._noise = normals_of(settings.seed, NOISE)
+        self._slip = normals_of(settings.seed, SLIP)
         self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
         self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
         self._held = HeldCommand(to_nanoseconds(settings.cmd_vel_timeout))
@@ -162,21 +164,20 @@ class PlantNode(LoopNode[PlantParameters]):
         return self._plans.get(command.stamp_ns, ((command.v, command.w),))
 
     def _on_plan(self, data: bytes) -> None:
-        try:
-            plan = decode_speeds(data)
-        except InvalidMessageError:
-            self._answer(self._join.reject(stamp_of(data)))
-            raise
+        plan = self._decoded(decode_speeds, data)
         self._plans[plan.stamp_ns] = plan.speeds
         self._take(Command(plan.stamp_ns, *plan.speeds[0]))
 
     def _on_command(self, data: bytes) -> None:
+        self._take(self._decoded(decode_command, data))
+
+    def _decoded(self, decode: Callable[[bytes], D], data: bytes) -> D:
+        """A command or plan; of one that cannot be used, its slot goes on without it."""
         try:
-            command = decode_command(data)
+            return decode(data)
         except InvalidMessageError:
             self._answer(self._join.reject(stamp_of(data)))
             raise
-        self._take(command)
 
     def _take(self, command: Command) -> None:
         if self._lockstep:
@@ -229,7 +230,7 @@ class PlantNode(LoopNode[PlantParameters]):
     def _may_be_lost(self, known: frozenset[tuple[str, bytes]]) -> bool:
         """May the pose of this step have come before a peer was up, be it at the start or started again?"""
         peers = self._peers()
-        return self.k == 0 or bool(peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
+        return self.k == 0 or (peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 
     def _no_answer(self) -> str:
         silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)

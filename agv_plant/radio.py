@@ -20,7 +20,7 @@ from agv_plant.channels.schedule import OUTAGE, Segment, is_scripted, segments_o
 from agv_plant.channels.shared import SCHEDULERS, serve, stream_of
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
-from agv_plant.random_stream import uniforms
+from agv_plant.random_stream import InBlocks, uniforms
 from agv_ros.parameters import LoopParameters
 from agv_ros.stamps import Grid, NearestSteps, Steps
 from agv_ros.wire import DELAYED, DELIVERED, LOST, Slot
@@ -58,19 +58,8 @@ class Verdict(NamedTuple):
     """Of the channel [dB], NaN if it has none."""
 
 
-class _Drawn:
-    """Random numbers of single slots, made in blocks."""
-
-    def __init__(self, make: Callable[[int, int], NDArray[np.float64]]) -> None:
-        self._make = make
-        self._first = -1
-        self._block: Sequence[Sequence[float]] = ()
-
-    def at(self, k: int) -> Sequence[float]:
-        first = k - k % _BLOCK
-        if first != self._first:
-            self._block, self._first = self._make(first, _BLOCK).tolist(), first
-        return self._block[k - first]
+def _in_blocks(make: Callable[[int, int], NDArray[np.float64]]) -> InBlocks[list[float]]:
+    return InBlocks(lambda first, count: make(first, count).tolist(), _BLOCK)
 
 
 class _Cell:
@@ -79,7 +68,7 @@ class _Cell:
     def __init__(self, parameters: ChannelParameters, seed: int, link: str) -> None:
         self._scheduler = SCHEDULERS.index(parameters.scheduler)
         self._drawn = [
-            _Drawn(functools.partial(uniforms, seed, stream_of(link, vehicle)))
+            _in_blocks(functools.partial(uniforms, seed, stream_of(link, vehicle)))
             for vehicle in range(parameters.vehicles)
         ]
         self._ages = [0] * parameters.vehicles
@@ -115,8 +104,8 @@ class Channel:
         self._floor = floor_of(parameters, seed, stream) if parameters.is_placed else []
         self._trace = load_trace(parameters.trace_file) if measured else ()
         self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
-        self._random = _Drawn(lambda first, count: draws(self.parameters, seed, stream, first, count))
-        self._random_delays = _Drawn(lambda first, count: delay_draws(seed, stream, first, count))
+        self._random = _in_blocks(lambda first, count: draws(self.parameters, seed, stream, first, count))
+        self._random_delays = _in_blocks(lambda first, count: delay_draws(seed, stream, first, count))
         self._next = 0
         self._state = GOOD
         self._last = Verdict(False)

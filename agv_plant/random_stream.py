@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+R = TypeVar("R")
 
 DRAWS = 4
 
@@ -36,19 +40,31 @@ def normal_pair(u_radius: float, u_angle: float) -> tuple[float, float]:
     return radius * math.cos(angle), radius * math.sin(angle)
 
 
-class Normals:
-    """Standard normal numbers of one stream, DRAWS for each step, whatever step was asked for before."""
+class InBlocks(Generic[R]):
+    """Random numbers of single steps, a row each, made some at a time; whatever step was asked for before."""
 
-    def __init__(self, seed: int, stream: str) -> None:
-        self._seed, self._stream = seed, stream
+    def __init__(self, make: Callable[[int, int], Sequence[R]], block: int) -> None:
+        """`make` gives the rows of the steps first .. first + count - 1."""
+        self._make, self._size = make, block
         self._first = -1
-        self._block: list[tuple[float, float, float, float]] = []
+        self._block: Sequence[R] = ()
 
-    def at(self, k: int) -> tuple[float, float, float, float]:
-        """Those of step k >= 0."""
-        first = k - k % _BLOCK
+    def at(self, k: int) -> R:
+        """The row of step k >= 0."""
+        first = k - k % self._size
         if first != self._first:
-            rows = uniforms(self._seed, self._stream, first, _BLOCK).tolist()
-            self._block = [(*normal_pair(a, b), *normal_pair(c, d)) for a, b, c, d in rows]
-            self._first = first
+            self._block, self._first = self._make(first, self._size), first
         return self._block[k - first]
+
+
+Normal = tuple[float, float, float, float]
+
+
+def normals_of(seed: int, stream: str) -> InBlocks[Normal]:
+    """Standard normal numbers of one stream, DRAWS for each step."""
+
+    def make(first: int, count: int) -> list[Normal]:
+        rows = uniforms(seed, stream, first, count).tolist()
+        return [(*normal_pair(a, b), *normal_pair(c, d)) for a, b, c, d in rows]
+
+    return InBlocks(make, _BLOCK)

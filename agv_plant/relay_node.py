@@ -1,6 +1,6 @@
 """The radio link: the only way between the AGV and the edge.
 
-With a DDS domain for each of them it is so by construction, and looks that nobody builds another way.
+With a DDS domain for each of them it is so by construction, and the relay looks that nobody builds another way.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ class RelayNode(LoopNode[RelayParameters]):
         )
         self._needs_place = settings.uplink.is_placed or settings.downlink.is_placed
         self._place = NOWHERE
-        self._is_new = True
         self._is_odometry, self._loses_stamp = settings.pose_type == ODOMETRY, settings.command_type == TWIST
         pose_kind = Odometry if self._is_odometry else PoseStamped
         kind, self._command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
@@ -74,9 +73,8 @@ class RelayNode(LoopNode[RelayParameters]):
                 )
 
     def _on_pose(self, data: bytes) -> None:
-        if self._is_new and self._agv is not self._edge:
+        if self._agv is not self._edge and not self.uplink.sent:
             self._look_for_ways_around()  # before the first pose is passed on, and every now and then from then on
-        self._is_new = False
         if self._needs_place:
             self._place = _place_in(data, self._is_odometry, self._place)
         passage = self.uplink.transmit(stamp_of(data), data, self._place)

@@ -31,7 +31,7 @@ from rclpy.signals import SignalHandlerOptions
 from agv_ros.errors import UserError
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid, to_nanoseconds
-from agv_ros.wire import InvalidMessageError, encode_diagnostics, stamp_of
+from agv_ros.wire import PUBLISHED, InvalidMessageError, encode_diagnostics, stamp_of
 
 P = TypeVar("P", bound=LoopParameters)
 
@@ -42,9 +42,6 @@ LOOP_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
 
-
-PUBLISHED = "published "
-"""Key, before the topic's name, under which a node's diagnostics say how many messages it has published there."""
 
 CHANGED = "changed "
 """Key, before a parameter's name, under which a node's diagnostics say how it was changed last while the node ran."""

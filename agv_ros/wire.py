@@ -37,6 +37,9 @@ LOST = "lost"
 DELAYED = "delayed"
 """What a slot says of its message; a delayed one comes in a later slot."""
 
+PUBLISHED = "published "
+"""Key, before the topic's name, under which a node's diagnostics say how many messages it has published there."""
+
 SQUARED_LENGTH = 0.01
 """How far the squared length of a rotation's quaternion may be from one."""
 

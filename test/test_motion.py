@@ -18,7 +18,7 @@ from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.chance import normals
 from agv_plant.motion import NOISE, SLIP, Body, Motion, body_of, move
 from agv_plant.parameters import PlantParameters
-from agv_plant.random_stream import Normals
+from agv_plant.random_stream import normals_of
 from agv_plant.slip import over_ground, side_slip
 from agv_plant.unicycle import STEPS
 
@@ -126,7 +126,7 @@ def test_an_agv_that_skids_solves_the_differential_equation() -> None:
 
 
 def test_numbers_of_the_node_are_those_of_the_simulation_in_any_order() -> None:
-    found, stream = normals(5, NOISE, 1000), Normals(5, NOISE)
+    found, stream = normals(5, NOISE, 1000), normals_of(5, NOISE)
     for k in (999, 0, 63, 64, 500, 1):
         assert stream.at(k) == tuple(found[k])
 

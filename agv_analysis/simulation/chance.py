@@ -13,7 +13,7 @@ from agv_plant.random_stream import DRAWS, normal_pair, uniforms
 
 
 def normals(seed: int, stream: str, steps: int) -> Floats:
-    """Standard normal numbers of the steps 0 .. steps - 1, shape (steps, DRAWS), as `random_stream.Normals`."""
+    """Standard normal numbers of the steps 0 .. steps - 1, shape (steps, DRAWS), as `random_stream.normals_of`."""
     found = np.empty((steps, DRAWS))
     compiled(_fill)(numbers(uniforms(seed, stream, 0, steps)), found)
     return found

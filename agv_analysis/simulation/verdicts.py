@@ -89,23 +89,13 @@ class Air:
     def _serve(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
         """Work out what becomes of the whole fleet."""
         streams = [stream_of(stream, vehicle) for vehicle in range(channel.vehicles)]
-        turns, fates = np.stack(
-            [uniforms(self._seed, name, 0, self._steps)[:, :2] for name in streams], axis=2
-        ).swapaxes(0, 1)
+        drawn = np.stack([uniforms(self._seed, name, 0, self._steps) for name in streams], axis=2)
         ages, scheduler = np.zeros(channel.vehicles, dtype=np.int64), SCHEDULERS.index(channel.scheduler)
         of_all = np.zeros((self._steps, channel.vehicles), dtype=np.bool_)
         for segment, end in _segments(channel, self._steps, self._ts):
-            part = slice(segment.first, end)
-            compiled(serve_all)(
-                segment.first,
-                channel.blocks,
-                scheduler,
-                segment.channel.p,
-                turns[part],
-                fates[part],
-                ages,
-                of_all[part],
-            )
+            u, p = drawn[segment.first : end], segment.channel.p
+            served = of_all[segment.first : end]
+            compiled(serve_all)(segment.first, channel.blocks, scheduler, p, u[:, 0], u[:, 1], ages, served)
         lost[:] = of_all[:, channel.vehicle]
 
     def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
