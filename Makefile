@@ -10,9 +10,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-PLUGINS := -p xdist -p hypothesis.extra.pytestplugin
-
-.PHONY: demo test coverage bench docs sample clean
+.PHONY: demo test bench docs sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -23,10 +21,7 @@ test: $(VENV)/test.stamp ## style, types and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest $(PLUGINS) -n auto --dist worksteal $(PYTEST_ARGS)
-
-coverage: $(VENV)/test.stamp ## the tests, with the lines and branches that they reach
-	$(BIN)/python -m pytest $(PLUGINS) -p pytest_cov -n auto --dist worksteal --cov --cov-report=term $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n auto --dist worksteal --cov --cov-report=term $(PYTEST_ARGS)
 
 bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
 	$(BIN)/python -m benchmarks $(BENCH)
