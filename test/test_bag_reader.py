@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +133,9 @@ def test_every_kind_of_mcap_file(tmp_path: Path, variant: str) -> None:
 
 @pytest.fixture
 def as_large(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files of any size are read as large ones are: by compiled code, each topic by a thread of its own."""
+    """Files of any size are read as large ones are: by compiled code."""
     for module in (bag_module, mcap_file):
         monkeypatch.setattr(module, "LARGE", 0)
-    monkeypatch.setattr(bag_module, "_MUCH", 0)
 
 
 @pytest.mark.usefixtures("as_large")
@@ -143,6 +143,43 @@ def as_large(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_large_files_are_read_as_small_ones(tmp_path: Path, variant: str) -> None:
     write_mcap(tmp_path / "bag.mcap", **VARIANTS[variant])
     assert_whole(tmp_path / "bag.mcap")
+
+
+IMPOSSIBLE: dict[str, tuple[Callable[[int], dict[str, int]], str]] = {
+    "backwards": (lambda i: {"log": -5 if i == 250 else 0}, "logged before the one that it follows: 1"),
+    "backwards over a chunk": (lambda i: {"log": 10**6 if i < 299 else 0}, "logged before the one that it follows: 1"),
+    "twice": (lambda i: {"log": -1 if i == 250 else 0, "of": 249 if i == 250 else i}, "there twice: 1"),
+    "of one time": (lambda i: {"log": -1 if i == 250 else 0}, ""),
+    "logged too late": (lambda i: {"log": 2**63 if i == 0 else 0}, "a log or publish time after the year 2262: 1"),
+    "published too late": (lambda i: {"publish": 2**63 if i == 7 else 0}, "publish time after the year 2262: 1"),
+    "fraction": (lambda i: {"fraction": 10**9 if i in (3, 200) else 0}, "header.stamp.nanosec of a second or more: 2"),
+    "none": (lambda i: {}, ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", IMPOSSIBLE)
+def test_times_that_cannot_be_are_found_in_large_files_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """In a large file they are looked at while the messages are copied, in a small one when all of them are there."""
+    change, said = IMPOSSIBLE[what]
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=5_000)
+        writer.start(profile="ros2", library="test")
+        text = STORE.generate_msgdef(POSE, ros_version=2)[0].encode()
+        channel = writer.register_channel("/pose", "cdr", writer.register_schema(POSE, "ros2msg", text))
+        for i in range(COUNT):
+            new = {"log": 0, "publish": 0, "fraction": 0, "of": i, **change(i)}
+            sent = pose(new["of"])
+            sent.header.stamp.nanosec += new["fraction"]
+            writer.add_message(channel, 1000 + i + new["log"], payload(sent), 990 + new["of"] + new["publish"])
+        writer.finish()  # type: ignore[no-untyped-call]
+    small = read_bag(tmp_path / "bag.mcap")
+    for module in (bag_module, mcap_file):
+        monkeypatch.setattr(module, "LARGE", 0)
+    assert read_bag(tmp_path / "bag.mcap").problems == small.problems
+    assert said in " ".join(small.problems)
+    assert bool(said) == bool(small.problems)
 
 
 @pytest.mark.usefixtures("as_large")

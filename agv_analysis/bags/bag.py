@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,12 +21,6 @@ from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import LARGE, Storage
 from agv_analysis.bags.table import Table
 from agv_analysis.bags.type_hash import contradicts
-
-_MUCH = 2**17
-"""A topic with so many bytes in a chunk of a large file is worth another thread."""
-
-_UNDER_WAY = 2**23
-"""Bytes of chunks that may wait for this thread."""
 
 _THREADS = 2
 """So many topics are checked at a time."""
@@ -109,27 +103,22 @@ def read_bag(path: Path | str, topics: Collection[str] | None = None, progress: 
     """
     path = Path(path)
     contents = locate(path)
-    with ThreadPoolExecutor(1, "bag") as pool:
-        reading = _Reading(topics, pool)
-        for number, storage in enumerate(open_files(contents)):
-            for channel, batch in storage.batches(reading.is_wanted):
-                reading.take(storage, channel, batch)
-                if progress is not None:
-                    share = storage.position / max(1, storage.size)
-                    progress(int(100 * (number + share) / len(contents.files)))
-            reading.finish(storage)
+    reading = _Reading(topics)
+    for number, storage in enumerate(open_files(contents)):
+        for channel, batch in storage.batches(reading.is_wanted):
+            reading.take(storage, channel, batch)
+            if progress is not None:
+                share = storage.position / max(1, storage.size)
+                progress(int(100 * (number + share) / len(contents.files)))
+        reading.finish(storage)
     return reading.bag(path, contents)
 
 
 class _Reading:
     """What has been read so far, over all files of a bag."""
 
-    def __init__(self, topics: Collection[str] | None, pool: ThreadPoolExecutor) -> None:
-        """`pool` is of one thread, which fills the tables of topics with much in them."""
+    def __init__(self, topics: Collection[str] | None) -> None:
         self._wanted = None if topics is None else frozenset(topics)
-        self._pool = pool
-        self._much: set[str] = set()
-        self._under_way: deque[tuple[int, Future[None]]] = deque()
         self._findings = Findings()
         self._known: dict[str, tuple[Channel, Schema | None]] = {}
         self._tables: dict[str, Table] = {}
@@ -151,33 +140,14 @@ class _Reading:
         table = latest[2]
         if table is None:
             return
-        if storage.size > LARGE and batch.total > _MUCH:
-            self._much.add(channel.topic)
-        if channel.topic in self._much:  # from now on, so that its messages keep their order
-            self._under_way.append((len(batch.buffer), self._pool.submit(self._append, channel.topic, table, batch)))
-            self._wait(_UNDER_WAY)
-        else:
-            self._append(channel.topic, table, batch)
-
-    def _append(self, topic: str, table: Table, batch: Batch) -> None:
-        if topic in self._refusals:  # since the batch was handed over
-            return
         try:
             table.append(batch)
         except UndecodableError as error:
-            self._refuse(topic, error)
-
-    def _wait(self, limit: int) -> None:
-        """Until the batches that are being taken lie in buffers of so many bytes together, or there is but one."""
-        while self._under_way and (limit == 0 or (len(self._under_way) > 1 and self._bytes_under_way() > limit)):
-            self._under_way.popleft()[1].result()
-
-    def _bytes_under_way(self) -> int:
-        return sum(size for size, _ in self._under_way)
+            self._refuse(channel.topic, error)
+            self._latest.clear()
 
     def finish(self, storage: Storage) -> None:
         """Take over what is known of a file after its last message."""
-        self._wait(0)
         for number, channel in storage.channels.items():
             self._counts[channel.topic] += storage.counts[number]
             self._known.setdefault(channel.topic, (channel, storage.schemas.get(channel.schema_id)))
@@ -222,8 +192,9 @@ class _Reading:
             if table.layouts.misfits:
                 what = f"{topic}: message that is not of its type, left out ({table.layouts.first_misfit})"
                 self._findings.add(what, table.layouts.misfits, is_loss=True)
+        unclear = [topic for topic in arrays if not self._tables[topic].is_orderly]
         with ThreadPoolExecutor(_THREADS, "bag") as pool:
-            for found in pool.map(check_times, arrays, arrays.values()):
+            for found in pool.map(check_times, unclear, map(arrays.__getitem__, unclear)):
                 self._findings.merge(found)
         for topic, reason in sorted(self._refusals.items()):
             self._findings.add(f"{topic}: topic that {reason}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,10 +24,14 @@ def check_times(topic: str, rows: NDArray[np.void]) -> Findings:
         impossible = (log_time < 0) | (rows[PUBLISH_TIME] < 0)
         _report(findings, f"{topic}: message with a log or publish time after the year 2262", impossible)
     for name in rows.dtype.names or ():
-        is_fraction = name.endswith(".nanosec") and rows.dtype[name].base == np.dtype("u4")
-        if is_fraction and rows[name].max(initial=0) >= NS_PER_S:
+        if is_fraction(name, rows.dtype[name].base) and rows[name].max(initial=0) >= NS_PER_S:
             _report(findings, f"{topic}: {name} of a second or more", rows[name] >= NS_PER_S)
     return findings
+
+
+def is_fraction(path: str, kind: np.dtype[Any]) -> bool:
+    """Are values of this path and type the nanoseconds of stamps?"""
+    return path.endswith(".nanosec") and kind == np.dtype("u4")
 
 
 def _report(findings: Findings, what: str, affected: NDArray[np.bool_]) -> None:

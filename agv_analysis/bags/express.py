@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Bytes, Ints
+from agv_analysis.bags.checks import is_fraction
 from agv_analysis.bags.layout import LEAD, Layout
 from agv_analysis.compiled import HAS_NUMBA, compiled
+from agv_ros.stamps import NS_PER_S
 
 MAX_LAYOUTS = 32
 """Each message is compared with so many layouts at most."""
@@ -45,18 +47,25 @@ class Recipes(NamedTuple):
     """(source, target, size), one layout after the other, shape (R, 3)."""
     first_run: Ints
     """Where those of each layout begin, and the end, shape (K + 1,)."""
+    fractions: Ints
+    """Where the nanoseconds of its stamps are, one layout after the other, shape (F,)."""
+    first_fraction: Ints
+    """Where those of each layout begin, and the end, shape (K + 1,)."""
 
 
 def recipes(known: Sequence[tuple[int, Layout, Sequence[Run]]]) -> Recipes:
     """Recipes for layouts, each with the size of its messages and its runs."""
     checks = [_checks(layout) for _, layout, _ in known]
     runs = [[tuple(run) for run in runs] for _, _, runs in known]
+    fractions = [_fractions(layout) for _, layout, _ in known]
     return Recipes(
         np.array([size for size, _, _ in known], np.int64),
         np.array([pair for pairs in checks for pair in pairs], np.int64).reshape(-1, 2),
         np.cumsum([0, *map(len, checks)]),
         np.array([run for some in runs for run in some], np.int64).reshape(-1, 3),
         np.cumsum([0, *map(len, runs)]),
+        np.array([offset for some in fractions for offset in some], np.int64),
+        np.cumsum([0, *map(len, fractions)]),
     )
 
 
@@ -70,6 +79,12 @@ def _checks(layout: Layout) -> list[tuple[int, int]]:
     return pairs
 
 
+def _fractions(layout: Layout) -> list[int]:
+    """Where the nanoseconds of stamps are in a message that can be copied in runs."""
+    leaves = [leaf for leaf in layout.leaves if is_fraction(leaf.path, np.dtype(leaf.code))]
+    return [leaf.offsets[0] + 4 * i for leaf in leaves for i in range(leaf.block or 1)]
+
+
 def place(
     buffer: Bytes,
     starts: Ints,
@@ -79,13 +94,18 @@ def place(
     first_check: Ints,
     runs: NDArray[np.int64],
     first_run: Ints,
+    fractions: Ints,
+    first_fraction: Ints,
     store: Bytes,
     row_size: int,
     row: int,
+    clock: Ints,
 ) -> int:
     """Copy messages, of `lengths` from `starts` on, to rows of `store` from `row` on, up to one of unknown layout.
 
-    Returns how many were copied. Written to be compiled.
+    `clock` holds the latest log time [ns] and how many messages have times that `check_times` would report: to look at
+    them here costs next to nothing, while afterwards all rows have to come from memory once more. Returns how many
+    messages were copied. Written to be compiled.
     """
     for i in range(len(starts)):
         begin, known = starts[i], -1
@@ -107,7 +127,22 @@ def place(
             of_message, of_row = buffer[source : source + size], store[target : target + size]
             for j in range(size):  # ten times as fast as with the places added to each index
                 of_row[j] = of_message[j]
+        log_time = number(buffer, begin, 8)
+        is_orderly = log_time > clock[0] and number(buffer, begin + 8, 8) >= 0
+        for f in range(first_fraction[known], first_fraction[known + 1]):
+            is_orderly = is_orderly and number(buffer, begin + fractions[f], 4) < NS_PER_S
+        clock[0] = log_time
+        if not is_orderly:
+            clock[1] += 1
     return len(starts)
+
+
+def number(buffer: Bytes, place: int, size: int) -> int:
+    """The little-endian number of so many bytes at a place; a single load, once compiled."""
+    value = np.int64(0)
+    for i in range(size):
+        value |= np.int64(buffer[place + i]) << (8 * i)
+    return int(value)
 
 
 def compiled_place() -> Callable[..., Any] | None:

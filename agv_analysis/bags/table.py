@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.batch import Batch, Bytes, Group, Ints, Layouts, values_at
+from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.errors import UndecodableError
 from agv_analysis.bags.express import MAX_LAYOUTS, Run, compiled_place, recipes
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
@@ -91,12 +92,18 @@ class Table:
         self._place = compiled_place() if is_large and not self._ragged else None
         self._recipes = recipes([])
         self._express: dict[tuple[int, int], tuple[int, Layout]] = {}
+        self._clock = np.array([-1, 0], np.int64)
 
     @property
     def rows(self) -> NDArray[np.void]:
         """The messages so far, one row each."""
         size = self._dtype.itemsize
         return self._store[: self._count * size].view(self._dtype)
+
+    @property
+    def is_orderly(self) -> bool:
+        """Have the times of all messages been looked at as they came, and has `check_times` nothing to report?"""
+        return self._place is not None and not self._clock[1]
 
     def append(self, batch: Batch) -> None:
         """Take a batch, except for those messages that are not of the table's type.
@@ -110,8 +117,9 @@ class Table:
             rest = batch.after(done) if done else batch
             self._make_room(len(rest))
             placed = self._place(
-                rest.buffer, rest.starts, rest.sizes, *self._recipes, self._store, self._dtype.itemsize, self._count
-            )
+                rest.buffer, rest.starts, rest.sizes, *self._recipes,
+                self._store, self._dtype.itemsize, self._count, self._clock,
+            )  # fmt: skip
             self._count += placed
             done += placed
             if done < len(batch):  # one of a layout that is not known yet
@@ -139,8 +147,9 @@ class Table:
             ranks = _ranks([group.places for group in groups], len(batch))
             for group in groups:
                 self._write(group, new, ranks[group.places])
-        if self._place is not None:
+        if self._place is not None and number:
             self._learn(groups)
+            self._look(new)
 
     def _learn(self, groups: list[Group]) -> None:
         """Let the fast lane know the layouts of these groups; it is closed if they are not for it, or too many."""
@@ -153,6 +162,12 @@ class Table:
             return
         known = zip(self._express.values(), plans, strict=True)
         self._recipes = recipes([(size, layout, runs) for (size, layout), (runs, _) in known])
+
+    def _look(self, new: NDArray[np.void]) -> None:
+        """Look at the times of rows that have not come by the fast lane."""
+        if new[LOG_TIME][0] <= self._clock[0] or check_times("", new).texts():
+            self._clock[1] += 1
+        self._clock[0] = new[LOG_TIME][-1]
 
     # -- storage -----------------------------------------------------------------------------------------------------
 
