@@ -21,7 +21,7 @@ from agv_analysis.bags import read_bag
 from agv_analysis.convergence import wrapped
 from agv_analysis.recording import TOPICS, loop_topics
 from agv_analysis.run import Floats, Run
-from agv_analysis.scenario import Scenario, parse_scenario
+from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import answer, at_rest, received
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.reference import Reference
@@ -76,7 +76,7 @@ def with_settings(scenario: Scenario, settings: Iterable[str]) -> Scenario:
 
     Raises ParameterError, or UserError if they change the sampling instants.
     """
-    changed = parse_scenario(scenario.to_yaml(), "parameters of the recording", settings)
+    changed = scenario.with_settings(settings, "parameters of the recording")
     if changed.grid != scenario.grid:
         raise UserError("ts and start_time are those of the recording, they cannot be set")
     return changed

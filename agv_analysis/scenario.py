@@ -42,9 +42,19 @@ class Scenario:
         at_edge = node in ("error_detector", "controller")
         return self.relay.edge_domain_id if at_edge else self.relay.plant_domain_id
 
+    def with_settings(self, settings: Iterable[str], name: str) -> Scenario:
+        """The scenario with settings `node.parameter=value` on top of it, called `name` in messages.
+
+        Raises ParameterError.
+        """
+        return Scenario(**resolve(SCHEMAS, self._sections(), settings, name))
+
     def to_yaml(self) -> str:
         """The whole scenario as a ROS 2 params file, with every default written out."""
-        return dump({node: {"ros__parameters": _plain(as_dict(getattr(self, node)))} for node in SCHEMAS})
+        return dump({node: {"ros__parameters": values} for node, values in self._sections().items()})
+
+    def _sections(self) -> dict[str, dict[str, Any]]:
+        return {node: _plain(as_dict(getattr(self, node))) for node in SCHEMAS}
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
