@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from agv_analysis.outages import ages
 from agv_analysis.run import LinkSlots
 from agv_analysis.simulation.on_air import Marks, Way, blank
 from agv_analysis.simulation.verdicts import Air, Verdicts, way_of
-from agv_plant.channels import GOOD
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import Channel, draws
 
@@ -19,21 +19,14 @@ class SimulatedLink:
     """A channel under one seed, asked by the loop or beforehand, and what became of its messages."""
 
     def __init__(self, channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> None:
-        relay = Channel(channel, seed, stream, ts)
         self.lost: Verdicts
         """What is lost wherever the AGV is, shape (N,)."""
-        if channel.is_placed or channel.model == "perfect":  # which nobody has to be asked for
-            self.lost = Air(seed, steps, ts).verdicts(channel, stream)
-            causes = [channel.model] * steps
-            for k in np.flatnonzero(self.lost).tolist():
-                causes[k] = relay.judge(k).cause
-            self._cause = np.array(causes, dtype=np.str_)
-            self._state = np.full(steps, GOOD)
-        else:
-            verdicts = [relay.judge(k) for k in range(steps)]
-            self.lost = np.array([verdict.lost for verdict in verdicts], dtype=np.bool_)
-            self._cause = np.array([verdict.cause for verdict in verdicts], dtype=np.str_)
-            self._state = np.array([verdict.state for verdict in verdicts], dtype=np.int64)
+        self.lost, self._state = Air(seed, steps, ts).fates(channel, stream)
+        self._cause = np.full(steps, channel.model)
+        if channel.entries or channel.lifetime < math.inf:  # which are causes of their own
+            relay = Channel(channel, seed, stream, ts)
+            causes = {k: relay.judge(k).cause for k in np.flatnonzero(self.lost).tolist()}
+            self._cause = np.array([causes.get(k, channel.model) for k in range(steps)])
         self.is_direct = channel.is_direct
         self.marks: Marks = blank(steps)
         """To be filled by the loop, if the link is not direct."""

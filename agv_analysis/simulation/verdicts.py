@@ -26,11 +26,12 @@ from agv_plant.channels.placed import floor_of, kind_of, levels_of
 from agv_plant.channels.schedule import Segment, is_scripted, segments_of
 from agv_plant.channels.shared import SCHEDULERS, serve_all, stream_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import delay_draws, draws, losses
+from agv_plant.radio import Channel, delay_draws, draws, losses
 from agv_plant.random_stream import uniforms
 from agv_ros.parameters import LoopParameters
 
 Verdicts = NDArray[np.bool_]
+States = NDArray[np.int64]
 
 _NUMERIC = [field.name for field in dataclasses.fields(ChannelParameters) if not isinstance(field.default, str)]
 _Numbers = namedtuple("_Numbers", _NUMERIC)  # type: ignore[misc]  # numba knows tuples, not dataclasses
@@ -56,6 +57,11 @@ class Air:
         """
         return self._verdicts(channel, stream)
 
+    def fates(self, channel: ChannelParameters, stream: str) -> tuple[Verdicts, States]:
+        """Verdicts, and the state that decided each, of a channel with memory; shapes (steps,). Neither is kept."""
+        states = np.full(self._steps, GOOD, dtype=np.int64)
+        return self._judge(channel, stream, states), states
+
     def way(self, channel: ChannelParameters, stream: str) -> Way:
         """All that a link needs to be asked slot by slot."""
         return self._ways(channel, stream)
@@ -64,7 +70,9 @@ class Air:
         lost, random = self.verdicts(channel, stream), self._draws(channel, stream)
         return way_of(channel, self._seed, stream, lost, random, self._ts)
 
-    def _judge(self, channel: ChannelParameters, stream: str) -> Verdicts:
+    def _judge(self, channel: ChannelParameters, stream: str, states: States | None = None) -> Verdicts:
+        """Verdicts, and into `states` the states that decided."""
+        states = np.empty(self._steps, dtype=np.int64) if states is None else states
         if channel.model == TRACE:  # nothing to compute
             return losses(channel, self._seed, stream, self._steps, self._ts)
         lost = np.zeros(self._steps, dtype=np.bool_)
@@ -72,12 +80,12 @@ class Air:
             self._serve(channel, stream, lost)
         elif channel.model != "perfect" and not channel.is_placed:
             try:
-                self._ask(channel, stream, lost)
+                self._ask(channel, stream, lost, states)
             except Exception:
                 if channel.model in MODELS:
                     raise
                 # Another package's model may be more than numba compiles: slot by slot it is the same, or says why not.
-                return losses(channel, self._seed, stream, self._steps, self._ts)
+                return _one_by_one(Channel(channel, self._seed, stream, self._ts), states)
         for segment, end in _segments(channel, self._steps, self._ts):
             if segment.outage.length > 0.0:
                 compiled(_script)(lost, segment.first, end, *segment.outage, self._ts)
@@ -98,12 +106,12 @@ class Air:
             compiled(serve_all)(segment.first, channel.blocks, scheduler, p, u[:, 0], u[:, 1], ages, served)
         lost[:] = of_all[:, channel.vehicle]
 
-    def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
+    def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts, states: States) -> None:
         """Ask the channel's model, slot by slot."""
         random, state = numbers(self._draws(channel, stream)), GOOD
         for segment, end in _segments(channel, self._steps, self._ts):
             parameters = _Numbers(*(getattr(segment.channel, name) for name in _NUMERIC))
-            state = _judge_all(channel.model)(parameters, random, lost, segment.first, end, state)
+            state = _judge_all(channel.model)(parameters, random, lost, states, segment.first, end, state)
 
     def _draws(self, channel: ChannelParameters, stream: str) -> NDArray[np.float64]:
         if channel.correlation == 0.0:
@@ -142,12 +150,21 @@ def _segments(channel: ChannelParameters, steps: int, ts: float) -> list[tuple[S
     return list(zip(found, [*(segment.first for segment in found[1:]), steps], strict=True))
 
 
+def _one_by_one(channel: Channel, states: States) -> Verdicts:
+    lost = np.empty(len(states), dtype=np.bool_)
+    for k in range(len(states)):
+        verdict = channel.judge(k)
+        lost[k], states[k] = verdict.lost, verdict.state
+    return lost
+
+
 @functools.cache
-def _judge_all(name: str) -> Callable[[Any, Any, Verdicts, int, int, int], int]:
+def _judge_all(name: str) -> Callable[[Any, Any, Verdicts, States, int, int, int], int]:
     model: Any = find_model(name)
 
-    def judge_all(channel: Any, random: Any, lost: Verdicts, first: int, end: int, state: int) -> int:
+    def judge_all(channel: Any, random: Any, lost: Verdicts, states: States, first: int, end: int, state: int) -> int:
         for k in range(first, end):
+            states[k] = state
             lost[k], state = model(channel, k, random[k], state)
         return state
 
