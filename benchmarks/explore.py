@@ -1,13 +1,19 @@
 """How fast the explorer answers: a lap of 20 000 steps simulated anew, its margins, and what the browser gets to draw.
 
-The peer is what a person bears: an answer within 0.2 s is one to the hand that moves the slider.
+The peer is what a person bears: an answer within 0.2 s is one to the hand that moves the slider. It is measured in the
+server alone, and, where Chromium is installed, in the browser from the key that moves the slider to the frame that
+shows both plots anew, while the criteria for the whole lap are computed beside it.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
+import subprocess
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from agv_analysis.explore.answer import answer
 from agv_analysis.explore.settings import Values, scenario_of, values_of
@@ -30,8 +36,8 @@ def measure() -> list[Comparison]:
             f"a move of a slider{what}", max(scenario_and_answer(base, move, pinned) for move in moves), "at once",
             AT_ONCE, "s", 1.0, smaller_is_better=True,
         )
-        for what, pinned in (("", None), (", one pinned", base))
-    ]  # fmt: skip
+        for what, pinned in ((", in the server", None), (", in the server, one pinned", base))
+    ] + in_the_browser()  # fmt: skip
 
 
 def scenario_and_answer(base: Scenario, values: Values, pinned: Scenario | None) -> float:
@@ -40,3 +46,60 @@ def scenario_and_answer(base: Scenario, values: Values, pinned: Scenario | None)
     found = answer(scenario_of(base, values), pinned)
     json.dumps((found.track, found.time))
     return time.perf_counter() - begun
+
+
+# -- in the browser ---------------------------------------------------------------------------------------------------
+
+WATCH = """
+const plots = [...document.querySelectorAll(".js-plotly-plot")];
+window.moved = new Promise(done => addEventListener("keydown", () => {
+  const begun = performance.now();
+  Promise.all(plots.map(plot => new Promise(drawn => plot.once("plotly_afterplot", drawn))))
+    .then(() => requestAnimationFrame(() => setTimeout(() => done(performance.now() - begun))));
+}, { capture: true, once: true }));
+"""
+"""Promises the milliseconds from the next key to the frame after the last plot is drawn."""
+
+
+def in_the_browser() -> list[Comparison]:
+    """The median and the slowest of ten moves as a person sees them; nothing where there is no Chromium."""
+    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if browser is None or driver is None:
+        return []
+    command = (sys.executable, "-m", "agv_analysis.cli", "explore", CONFIG, "--port", "0", "--no-browser")
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
+        assert served.stdout is not None
+        try:
+            moves = sorted(_moves(browser, driver, served.stdout.readline().split()[1]))
+        finally:
+            served.terminate()
+    return [
+        Comparison(f"{what} move in the browser", seconds, "at once", AT_ONCE, "s", 1.0, smaller_is_better=True)
+        for what, seconds in (("median", moves[len(moves) // 2]), ("slowest", moves[-1]))
+    ]
+
+
+def _moves(browser: str, driver: str, address: str) -> list[float]:
+    """How long ten moves of a slider take [s]."""
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+    from selenium.webdriver.common.keys import Keys
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = browser
+    for argument in ("headless=new", "no-sandbox", "disable-dev-shm-usage", "window-size=1300,1200"):
+        options.add_argument(f"--{argument}")
+    chrome: Any = webdriver.Chrome(options=options, service=Service(driver))
+    try:
+        chrome.get(address)
+        shown = "return document.querySelectorAll('#told tr, #lap tr').length > 12"  # both tables, so all is compiled
+        WebDriverWait(chrome, 120.0).until(lambda _: chrome.execute_script(shown))
+        handle, found = chrome.find_element("css selector", "#kx [role=slider]"), []
+        for _ in range(10):
+            chrome.execute_script(WATCH)
+            handle.send_keys(Keys.ARROW_RIGHT)
+            found.append(1e-3 * chrome.execute_async_script("window.moved.then(arguments[0])"))
+        return found
+    finally:
+        chrome.quit()

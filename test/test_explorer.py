@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -142,6 +143,20 @@ def test_the_presets_tell_the_story(base: Scenario) -> None:
     assert paper == "holds for any number of outages"
     assert error > 1e3
     assert late("predicted")[0] < 1e-6
+
+
+def test_a_preset_undoes_what_the_file_says_of_radio_and_agv(base: Scenario) -> None:
+    """Whatever the page was started with, a preset shows what its text says, and the page shows what it took."""
+    worse = [
+        "relay.uplink.jitter=0.05", "relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "plant.lag=0.2",
+        "relay.uplink.schedule=10: outage=3", "relay.uplink.lifetime=0.05", "plant.speed_scale=0.8",
+    ]  # fmt: skip
+    spoilt = base.with_settings([*worse, "plant.duration=50.0"], "test")
+    for key in PRESETS:
+        values, expected = preset_values(spoilt, key), scenario_of(base, preset_values(base, key))
+        assert len(values["more"].splitlines()) == len(worse)
+        found = scenario_of(spoilt, values)
+        assert found == dataclasses.replace(expected, plant=dataclasses.replace(expected.plant, duration=50.0))
 
 
 def test_the_counterexample_is_a_pose_that_is_always_as_old(base: Scenario) -> None:
@@ -305,6 +320,35 @@ def test_what_is_exported_is_what_is_shown(page: Page, base: Scenario) -> None:
     assert command == "agv-ncs simulate explored.yaml --report explored.html"
     found = parse_scenario(text, "exported")
     assert found == dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=26.0))
+
+
+def test_it_is_dark_where_all_else_is(page: Page) -> None:
+    """Paper and ink, on the page and in its plots, are as far apart as the guidelines for the web ask (4.5)."""
+
+    def contrast(one: str, other: str) -> float:
+        def luminance(colour: str) -> float:
+            parts = [int(part) / 255.0 for part in re.findall(r"\d+", colour)[:3]]
+            red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts)
+            return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+        low, high = sorted((luminance(one), luminance(other)))
+        return (high + 0.05) / (low + 0.05)
+
+    def colour(selector: str, name: str) -> str:
+        script = "return getComputedStyle(document.querySelector(arguments[0]))[arguments[1]]"
+        return str(page.chrome.execute_script(script, selector, name))
+
+    papers = {}
+    try:
+        for scheme in ("dark", "light"):
+            wanted = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+            page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", wanted)
+            papers[scheme] = colour("body", "backgroundColor")
+            inks = [colour("#told", "color"), colour("label", "color"), colour("#plot-time .xtick text", "fill")]
+            assert min(contrast(ink, papers[scheme]) for ink in inks) > 4.5, inks
+    finally:
+        page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert contrast("0, 0, 0", papers["dark"]) < 2.0 < contrast("0, 0, 0", papers["light"])
 
 
 # -- on the command line ----------------------------------------------------------------------------------------------

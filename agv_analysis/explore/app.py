@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -18,14 +19,26 @@ KEYS = (*(slider.key for slider in SLIDERS), *CHOICES, "more")
 """Everything on the page that can be set, in the order in which it comes to a callback."""
 
 STYLE = """
-body { margin: 0; font: 15px/1.4 system-ui, sans-serif; color: #1b1f24; background: #fff }
+:root { color-scheme: light dark; --paper: #fff; --ink: #1b1f24; --soft: #5b6570; --line: #d9dee3; --bad: #cf222e }
+@media (prefers-color-scheme: dark) {
+  :root { --paper: #14171a; --ink: #e6e9ec; --soft: #9aa4ae; --line: #343b42; --bad: #ff7b72 }
+  :root, .dash-dropdown-content {
+    --Dash-Fill-Inverse-Strong: #14171a; --Dash-Text-Primary: #e6e9ec; --Dash-Text-Strong: #e6e9ec;
+    --Dash-Text-Weak: #9aa4ae; --Dash-Stroke-Strong: #5b6570; --Dash-Stroke-Weak: #343b42;
+    --Dash-Text-Disabled: #9aa4ae; --Dash-Fill-Disabled: #5b6570; --Dash-Fill-Weak: #343b42;
+    --Dash-Fill-Primary-Hover: #343b42; --Dash-Fill-Primary-Active: #343b42;
+  }
+}
+body { margin: 0; font: 15px/1.4 system-ui, sans-serif; color: var(--ink); background: var(--paper) }
 main { display: flex; flex-wrap: wrap; gap: 1rem; padding: 1rem; max-width: 1400px; margin: auto }
 #controls { flex: 1 1 300px; max-width: 420px } #shown { flex: 3 1 560px; min-width: 0 }
-#problem { color: #cf222e; min-height: 1.4em; white-space: pre-wrap } h1 { font-size: 1.2rem; margin: 0 0 .5rem }
-label { display: block; font-size: .85rem; color: #5b6570; margin-top: .3rem }
+#problem { color: var(--bad); min-height: 1.4em; white-space: pre-wrap } h1 { font-size: 1.2rem; margin: 0 0 .5rem }
+label { display: block; font-size: .85rem; color: var(--soft); margin-top: .3rem }
 button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
 th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
 pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
+.js-plotly-plot .main-svg text:not(.hovertext *) { fill: var(--ink) !important }
+.js-plotly-plot .gridlayer path { stroke: var(--line) !important }
 """
 
 
@@ -150,7 +163,7 @@ def _table(html: Any, rows: list[tuple[str, str, str]]) -> list[Any]:
 
 
 def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page until Ctrl-C; `ready` is told its address. Port 0: any free one.
+    """Serve the page until Ctrl-C or SIGTERM; `ready` is told its address. Port 0: any free one.
 
     Raises UserError if the port is taken or Dash is not installed.
     """
@@ -162,6 +175,7 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
         server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet)
     except (OSError, SystemExit) as error:
         raise UserError(f"port {port} of {HOST} cannot be used: {error}: choose another with --port") from None
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         ready(f"http://{HOST}:{server.server_port}/")
         server.serve_forever()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agv_analysis.scenario import Scenario, parse_scenario
+from agv_analysis.scenario import Scenario
 from agv_cloud.staleness import POLICIES
 from agv_cloud.tracks import TRACKS
 from agv_plant.channels import MODELS
+from agv_plant.parameters import PlantParameters, RelayParameters
+from agv_ros.parameters import LoopParameters, as_dict
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def values_of(scenario: Scenario) -> dict[str, Any]:
 
 def scenario_of(base: Scenario, values: Values) -> Scenario:
     """The base scenario with what is set on the page. Raises ParameterError, whose text says what is allowed."""
-    return parse_scenario(base.to_yaml(), "the page", settings_of(base, values))
+    return base.with_settings(settings_of(base, values), "the page")
 
 
 def settings_of(base: Scenario, values: Values) -> list[str]:
@@ -162,5 +165,31 @@ PRESETS = {
 
 
 def preset_values(base: Scenario, key: str) -> dict[str, Any]:
-    """Where sliders and lists stand for a preset."""
-    return values_of(parse_scenario(base.to_yaml(), "the page", PRESETS[key].settings))
+    """Where sliders and lists stand for a preset, and what else has to be set for radio and AGV to be the paper's."""
+    values = values_of(base.with_settings(PRESETS[key].settings, "the page"))
+    return {**values, "more": "\n".join(_back_to_default(base))}
+
+
+def _back_to_default(base: Scenario) -> list[str]:
+    """Settings that undo what a scenario says of its links and of its AGV's body, but for what is on the page."""
+    changes = {"plant": as_dict(base.plant), "relay": as_dict(base.relay)}
+    defaults = {"plant": as_dict(PlantParameters()), "relay": as_dict(RelayParameters())}
+    return [
+        f"{node}.{name}={_literal(default)}"
+        for node, values in defaults.items()
+        for name, default in values.items()
+        if changes[node][name] != default and f"{node}.{name}" not in _TARGETS.values() and name not in _KEPT
+    ]
+
+
+_KEPT = (*as_dict(LoopParameters()), "initial_pose", "clock", "duration", "seed")
+"""Parameters of the plant's, and of the relay's, that a preset leaves as they are."""
+
+
+def _literal(value: object) -> str:
+    """A value as a setting has it."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float) and math.isinf(value):
+        return ".inf" if value > 0.0 else "-.inf"
+    return json.dumps(value)

@@ -205,12 +205,13 @@ def thinned(line: Line, most: int) -> Line:
     """
     if len(line.x) <= most:
         return line
-    stretches = max(1, most // 2)
-    edges = np.linspace(0, len(line.x), stretches + 1).astype(np.int64)[:-1]
-    width = np.diff(np.append(edges, len(line.x)))
-    stretch = np.repeat(np.arange(stretches), width)
-    lowest = np.lexsort((np.where(np.isnan(line.y), np.inf, line.y), stretch))[edges]
-    highest = np.lexsort((np.where(np.isnan(line.y), np.inf, -line.y), stretch))[edges]
+    width = -(-len(line.x) // max(1, most // 2))
+    begins = np.arange(0, len(line.x), width)
+    missing = np.full(len(begins) * width - len(line.x), np.nan)
+    stretches = np.concatenate((line.y, missing)).reshape(-1, width)
+    blank = np.isnan(stretches)
+    lowest = begins + np.where(blank, np.inf, stretches).argmin(axis=1)
+    highest = begins + np.where(blank, -np.inf, stretches).argmax(axis=1)
     kept = np.unique(np.concatenate((lowest, highest, [0, len(line.x) - 1])))
     return replace(line, x=line.x[kept], y=line.y[kept])
 

@@ -17,8 +17,8 @@ COLOURS = {REFERENCE: "#8a8a8a", DRIVEN: "#3b8bd0", LOST: "#e0453c", OTHER: "#e3
 MOST_POINTS = 20_000
 """Points of one line in a report; longer runs are thinned."""
 
-_MOST_DOTS = 5_000
-"""Points that are drawn one by one, each an element of the page."""
+_LINE_PER_DOT = 4
+"""A point that is drawn by itself, an element of the page, takes as long as so many points of a line."""
 
 _GAP = 0.22
 """Share of a row that is left free above it, for its legend."""
@@ -65,7 +65,7 @@ def _y_axis(panel: Panel) -> dict[str, Any]:
 
 
 def _trace(line: Line, most: int) -> dict[str, Any]:
-    line = thinned(line, min(most, _MOST_DOTS) if line.style == DOTS else most)
+    line = thinned(line, most // _LINE_PER_DOT if line.style == DOTS else most)
     colour = COLOURS[line.role]
     trace: dict[str, Any] = {"name": line.name, "x": _packed(line.x), "y": _packed(line.y), "showlegend": True}
     if line.style == BARS:
