@@ -113,6 +113,7 @@ def _digest(function: types.FunctionType) -> str:
     digest = hashlib.sha256()
     for part in _functions(function):
         digest.update(Path(part.__code__.co_filename).read_bytes())
+        digest.update(part.__code__.co_code)  # which tells apart functions of one file
         constants = {name: value for name, value in _named(part) if isinstance(value, (bool, int, float, str))}
         digest.update(repr(sorted(constants.items())).encode())
     return digest.hexdigest()[:16]

@@ -15,6 +15,8 @@ from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.loop import Case, at_rest, history, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio import losses
 
 ROOT = Path(__file__).parent.parent
 PAPER = str(ROOT / "config" / "paper.yaml")
@@ -110,6 +112,29 @@ def test_a_change_in_any_file_or_constant_is_seen_in_spite_of_the_cache(tmp_path
     assert in_another_process(CALL, cache, str(folder)) == "40.0\n"
     (folder / "constants.py").write_text("FACTOR = 100.0\n")
     assert in_another_process(CALL, cache, str(folder)) == "400.0\n"
+
+
+LOST = """
+import sys
+from agv_analysis.simulation.verdicts import Air
+from agv_plant.parameters import ChannelParameters
+channel = ChannelParameters(model=sys.argv[1], p=0.5, r=0.5, n=2)
+print(*Air(3, 40).verdicts(channel, "uplink").astype(int), sep="")
+"""
+
+
+def test_what_is_kept_of_one_channel_model_is_not_taken_for_another(tmp_path: Path) -> None:
+    """All of them run through one loop, whose code does not say which model is in it."""
+    pytest.importorskip("numba")
+    models = ("bernoulli", "burst", "gilbert_elliott")
+    found = [in_another_process(LOST, tmp_path, model) for model in models]
+    kept = sorted(tmp_path.rglob("*.nbc"))
+    assert found[1] == f"0{'110' * 13}\n"
+    for model, verdicts in zip(models, found, strict=True):
+        expected = losses(ChannelParameters(model=model, p=0.5, r=0.5, n=2), 3, "uplink", 40)
+        assert verdicts == "".join(map(str, expected.astype(int))) + "\n"
+    assert [in_another_process(LOST, tmp_path, model) for model in models] == found
+    assert sorted(tmp_path.rglob("*.nbc")) == kept, "what was kept was not found again"
 
 
 def test_where_nothing_can_be_kept_it_is_compiled_each_time(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import types
 from collections import namedtuple
 from collections.abc import Callable
 from typing import Any
@@ -159,16 +160,25 @@ def _one_by_one(channel: Channel, states: States) -> Verdicts:
 
 
 @functools.cache
-def _judge_all(name: str) -> Callable[[Any, Any, Verdicts, States, int, int, int], int]:
-    model: Any = find_model(name)
+def _judge_all(name: str) -> Callable[..., int]:
+    """`judge_all` with a channel's model in it, compiled.
 
-    def judge_all(channel: Any, random: Any, lost: Verdicts, states: States, first: int, end: int, state: int) -> int:
-        for k in range(first, end):
-            states[k] = state
-            lost[k], state = model(channel, k, random[k], state)
-        return state
+    The model is a global of the function and not enclosed by it, since what is compiled of a closure cannot be kept.
+    """
+    known = {**globals(), "model": find_model(name)}
+    return compiled(types.FunctionType(judge_all.__code__, known, judge_all.__name__))
 
-    return compiled(judge_all)
+
+model: Any = MODELS["perfect"]
+"""Of the channel that `judge_all` is made for; as it stands here, one that loses nothing."""
+
+
+def judge_all(channel: Any, random: Any, lost: Verdicts, states: States, first: int, end: int, state: int) -> int:
+    """Verdicts of the slots first .. end - 1, and the states before them; returns the one after them."""
+    for k in range(first, end):
+        states[k] = state
+        lost[k], state = model(channel, k, random[k], state)
+    return state
 
 
 def _script(lost: Verdicts, first: int, end: int, at: float, length: float, period: float, ts: float) -> None:
