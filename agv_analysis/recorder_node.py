@@ -36,6 +36,7 @@ TOPICS: dict[str, type] = {
     "edge/slot": TimeReference,
     "edge/age": TimeReference,
     "edge/error": Odometry,
+    "edge/reference_pose": PoseStamped,
     "edge/horizon": MultiDOFJointTrajectory,
     "edge/cmd_vel": TwistStamped,
     "edge/plan": MultiDOFJointTrajectory,

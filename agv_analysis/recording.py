@@ -17,6 +17,7 @@ from agv_analysis.bags import Bag, read_bag
 from agv_analysis.convergence import body_errors, wrapped
 from agv_analysis.run import Floats, LinkSlots, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
+from agv_cloud.parameters import PATH
 from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S, Grid
@@ -25,8 +26,8 @@ from agv_ros.wire import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_qu
 Steps = NDArray[np.int64]
 
 TOPICS = (
-    "agv/pose", "agv/ground_truth", "edge/pose", "edge/slot", "edge/age", "edge/error", "edge/cmd_vel", "agv/cmd_vel",
-    "agv/slot",
+    "agv/pose", "agv/ground_truth", "edge/pose", "edge/slot", "edge/age", "edge/error", "edge/reference_pose",
+    "edge/cmd_vel", "agv/cmd_vel", "agv/slot",
 )  # fmt: skip
 
 _NEEDED = ("agv/pose", "edge/slot", "edge/error", "edge/cmd_vel")
@@ -170,7 +171,7 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         k=k,
         pose=_postures(true, "pose", k, scenario.plant.initial_pose[2]) if knows else sent,
         measured=sent if knows else None,
-        reference=Reference(scenario.error_detector).first(int(k[-1]) + 1)[k],
+        reference=_reference(on_steps, k, scenario, source),
         error=_errors(on_steps["edge/error"], k),
         command=_commands(on_steps["edge/cmd_vel"], k),
         n_ul=n_ul,
@@ -186,6 +187,25 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
     return dataclasses.replace(
         run, notes=(*bag.problems, *_replayed(bag), *_notes(on_steps, names), *_mismatch(run), *unknown)
     )
+
+
+def _reference(on_steps: Mapping[str, OnSteps], k: Steps, scenario: Scenario, source: str) -> Floats:
+    """X_r and its speeds at the steps `k`, shape (N, 5): those of the track, or, where paths were driven, as recorded.
+
+    Where the edge did not answer, the recorded ones are interpolated. Raises UserError if there are none.
+    """
+    if scenario.error_detector.track != PATH:
+        return Reference(scenario.error_detector).first(int(k[-1]) + 1)[k]
+    postures, errors = on_steps.get("edge/reference_pose", _NOTHING), on_steps["edge/error"]
+    known = np.intersect1d(postures.k, errors.k, assume_unique=True)
+    if not len(known):
+        raise UserError(
+            f"{source}: the reference came as a path while the loop ran, and nothing of it is on edge/reference_pose: "
+            "without it there is nothing to compare the poses with"
+        )
+    speeds = [errors.column(f"twist.twist.{speed}", known) for speed in ("linear.x", "angular.z")]
+    rows = np.column_stack([_postures(postures, "pose", known, scenario.plant.initial_pose[2]), *speeds])
+    return np.column_stack([np.interp(k, known, column) for column in rows.T])
 
 
 def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.bool_], LinkSlots]:
@@ -266,6 +286,8 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
     }
     if len(on_steps.get("edge/age", _NOTHING).k):
         expected["edge/error"] = on_steps["edge/age"].k
+    if len(on_steps.get("edge/reference_pose", _NOTHING).k):
+        expected["edge/reference_pose"] = on_steps["edge/error"].k
     if len(on_steps.get("agv/ground_truth", _NOTHING).k):
         expected["agv/ground_truth"] = poses
     if "agv/slot" in on_steps:

@@ -24,7 +24,8 @@ from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import answer, at_rest, received
 from agv_analysis.simulation.single import settings_of
-from agv_cloud.reference import Reference
+from agv_cloud.parameters import PATH
+from agv_cloud.reference import Reference, ReferencePoint
 from agv_cloud.staleness import Posture, Prediction
 from agv_plant.unicycle import STEPS
 from agv_ros.errors import UserError
@@ -110,20 +111,29 @@ def _held(run: Run) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     return held, run.k[held] == run.k - run.n_ul
 
 
+def _reference(run: Run, scenario: Scenario) -> list[ReferencePoint]:
+    """The reference of each row of a run: that of the scenario's track, or, along paths, the recorded one."""
+    if scenario.error_detector.track == PATH:
+        return [ReferencePoint(*row) for row in run.reference.tolist()]
+    reference = Reference(scenario.error_detector)
+    return [reference[k] for k in run.k.tolist()]
+
+
 def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
     """Errors, shape (N, 3), and commands, shape (N, 2); NaN where the recording does not hold the edge's pose."""
-    settings, reference = settings_of(scenario), Reference(scenario.error_detector)
+    settings, reference = settings_of(scenario), _reference(run, scenario)
     held, there = _held(run)
     rows = np.full((len(run), 5), np.nan)
     predicts = scenario.error_detector.policy == "predict"
     prediction = Prediction(STEPS[scenario.error_detector.integration], run.ts)
-    for i in np.flatnonzero(there).tolist():
-        k, taken = int(run.k[i]), int(run.k[held[i]])
-        pose = Posture(*run.sent_pose[held[i]].tolist())
+    for i in map(int, np.flatnonzero(there)):
+        row = int(held[i])
+        k, taken = int(run.k[i]), int(run.k[row])
+        pose = Posture(*run.sent_pose[row].tolist())
         if predicts:
             pose = prediction.at(k, taken, pose)
-        at_edge = received(at_rest(*pose), *pose, *reference[taken][:3], k - taken)
-        rows[i] = answer(at_edge, *reference[k], settings)
+        at_edge = received(at_rest(*pose), *pose, *reference[row][:3], k - taken)
+        rows[i] = answer(at_edge, *reference[i], settings)
         if predicts and np.isfinite(run.command[i]).all():
             prediction.add_command(k, *run.command[i].tolist())
     return rows[:, :3], rows[:, 3:]

@@ -6,19 +6,22 @@ It steps with each slot that the relay announces, lost or not; or, behind a real
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import copy
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_cloud.freshest_pose import FreshestPose
-from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference
-from agv_cloud.reference_path import path_points
+from agv_cloud.parameters import PATH, ErrorDetectorParameters
+from agv_cloud.path_track import Curve, PathError, PathReference, PathTrack, Point
+from agv_cloud.reference import Reference, ReferencePoint
+from agv_cloud.reference_path import path_points, thinned
 from agv_cloud.staleness import Posture, Prediction
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.unicycle import STEPS
@@ -41,6 +44,7 @@ from agv_ros.wire import (
     decode_pose,
     decode_slot,
     encode_error,
+    encode_pose,
     encode_slot,
     quaternion_of_yaw,
     stamp_of,
@@ -49,13 +53,19 @@ from agv_ros.wire import (
 TIMER = "timer"
 """What edge/age says of its slots, in place of a verdict."""
 
+_PATH_TOPIC = "edge/path"
+
+_LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""A copy of it is used: rclpy writes a topic's overrides into the profile that it is given."""
+
 
 class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
     """Answers each uplink slot, or each tick of its clock, with one edge/error, be its pose fresh or outdated."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("error_detector", ErrorDetectorParameters, **node_options)
-        self.reference = Reference(self.settings)
+        is_path = self.settings.track == PATH
+        self.reference: Reference | PathReference = PathReference() if is_path else Reference(self.settings)
         self._join: SlotJoin[Pose] = SlotJoin(self.grid.start_ns)
         self._steps = Steps(self.grid)
         self._blind = 0
@@ -74,26 +84,34 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._timer: Any = None
         self._missed = 0
         self._oldest_ns = 0
+        self._path_out = self.create_publisher(Path, "edge/reference", copy(_LATCHED))
+        self._points: list[Point] = []
+        self._paths = 0
+        self._hears_paths = False
+        self._refusal = ""
+        self._reference_out = self.output(PoseStamped, "edge/reference_pose", side=True) if is_path else None
         kind = Odometry if self._is_odometry else PoseStamped
+        heard = [output for output in (self._error_out, self._reference_out) if output is not None]
         if self.settings.trigger == TIMER:
             self._age_out = self.output(TimeReference, "edge/age", side=True)
-            self.input(kind, "edge/pose", self._keep_pose, self._error_out)
+            self.input(kind, "edge/pose", self._keep_pose, *heard)
             # Not used; but a relay, if there is one, may be told to wait until somebody hears its slots.
             self.input(TimeReference, "edge/slot", lambda _: None)
         else:
-            self.input(kind, "edge/pose", self._on_pose, self._error_out)
-            self.input(TimeReference, "edge/slot", self._on_slot, self._error_out)
-        self._publish_path()
+            self.input(kind, "edge/pose", self._on_pose, *heard)
+            self.input(TimeReference, "edge/slot", self._on_slot, *heard)
+        if isinstance(self.reference, Reference):
+            self._show(path_points(self.reference, self.settings))
+        else:
+            self._listen_for_paths()
         if self._predicts:
             self.input(TwistStamped, "edge/cmd_vel", self._on_command)
 
-    def _publish_path(self) -> None:
-        """The reference for those who look on, once and latched; no part of the loop, so nobody is waited for."""
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._path_out = self.create_publisher(Path, "edge/reference", latched)
+    def _show(self, points: Iterable[ReferencePoint]) -> None:
+        """The reference for those who look on, latched; no part of the loop, so nobody is waited for."""
         path = Path()
         path.header.frame_id = FRAME_MAP
-        for point in path_points(self.reference, self.settings):
+        for point in points:
             pose = PoseStamped()
             pose.header.frame_id = FRAME_MAP
             pose.pose.position.x, pose.pose.position.y = point.x, point.y
@@ -104,8 +122,70 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
     def _new_prediction(self) -> Prediction:
         return Prediction(STEPS[self.settings.integration], self.settings.ts)
 
+    def _forget_the_run_before(self) -> None:
+        """A run begins: what was sent in one before it is past."""
+        self._prediction = self._new_prediction()
+        if isinstance(self.reference, PathReference):
+            self.reference.restart()
+
     def _decode_pose(self, data: bytes) -> Pose:
         return decode_odometry(data) if self._is_odometry else decode_pose(data)
+
+    # -- along paths -------------------------------------------------------------------------------------------------
+
+    def _listen_for_paths(self) -> None:
+        """To planners, which publish a path once, and to one that somebody latched before this node was there.
+
+        No single subscription gets both, and one for what is latched is complained of by those who do not latch.
+        """
+        where = self.resolve_topic_name(_PATH_TOPIC)
+
+        def catch_up() -> bool:
+            offered = [info.qos_profile.durability for info in self.get_publishers_info_by_topic(where)]
+            if _LATCHED.durability in offered:
+                self.create_subscription(Path, _PATH_TOPIC, self._on_latched_path, copy(_LATCHED), raw=True)
+                return True
+            return self._hears_paths
+
+        self.input(Path, _PATH_TOPIC, self._on_path)
+        self.poll(catch_up)
+        self.get_logger().info(f"waiting for a path on {where}: the AGV shall stand still until one comes")
+
+    def _on_path(self, data: bytes) -> None:
+        self._hears_paths = True
+        self._take_path(data)
+
+    def _on_latched_path(self, data: bytes) -> None:
+        if not self._hears_paths:  # from then on both subscriptions hear whoever latches
+            self._take_path(data)
+
+    def _take_path(self, data: bytes) -> None:
+        """Drive another path than the last one; one that cannot be driven is counted, and the last one holds."""
+        try:
+            points = _points_of(data)
+            if points != self._points:
+                self._replace_path(Curve(points, self.settings.corner))
+                self._points = points
+        except PathError as error:
+            self.rejected[_PATH_TOPIC] += 1
+            if str(error) != self._refusal:
+                self._refusal = str(error)
+                self.get_logger().warning(f"{_PATH_TOPIC}: path rejected: {error}; more like it are only counted")
+            self.report(self._last_ns)  # the path's own stamp is not of the loop's time
+
+    def _replace_path(self, curve: Curve) -> None:
+        assert isinstance(self.reference, PathReference)
+        track = PathTrack(curve, self.settings.speed, self.settings.ts)
+        self.reference.replace(track)
+        self._paths += 1
+        x, y, _ = curve.at(0.0)
+        self.get_logger().info(f"path {self._paths}: {curve.length:.3f} m from ({x:.3f}, {y:.3f}) m on")
+        self._show(thinned(track, track.steps))
+
+    def _reference_at(self, k: int, held: Posture) -> ReferencePoint:
+        """The reference at step k; before the first path, that the AGV stands where it is held to be."""
+        found = self.reference[k]
+        return ReferencePoint(*held, 0.0, 0.0) if found is None else found
 
     # -- by slots ----------------------------------------------------------------------------------------------------
 
@@ -147,7 +227,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             return
         k = self.grid.step(stamp_ns)
         if k == 0:
-            self._prediction = self._new_prediction()  # a run begins: what was sent in one before it is past
+            self._forget_the_run_before()
         self._compare(k, self.grid.step(pose.stamp_ns), pose)
 
     # -- by its own clock --------------------------------------------------------------------------------------------
@@ -170,7 +250,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             )
             return
         self._steps = Steps(self.grid)
-        self._prediction = self._new_prediction()
+        self._forget_the_run_before()
         self._answered = -1
         # From here on, so that its ticks come just after the AGV's instants: a command must not be from the future.
         if self._timer is None:
@@ -204,29 +284,36 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
 
     def _compare(self, k: int, taken: int, pose: Pose) -> None:
         """Publish the error of step k, as a pose tells it that was taken at step `taken`."""
-        stamp_ns, now, held = self.grid.stamp(k), self.reference[k], Posture(pose.x, pose.y, pose.theta)
-        target = self.reference[taken] if self.settings.policy == "align" else now
+        stamp_ns, held = self.grid.stamp(k), Posture(pose.x, pose.y, pose.theta)
         if self._predicts:
             held = self._prediction.at(k, taken, held)
+        if isinstance(self.reference, PathReference):
+            self.reference.begin(k)
+        now = self._reference_at(k, held)
+        target = self._reference_at(taken, held) if self.settings.policy == "align" else now
         eps = tracking_error(target.x, target.y, target.theta, *held)
         self._answered = k
         error = TrackingError(stamp_ns, *eps, now.v, now.w)
         if self._horizon_out is not None:
-            self._horizon_out.publish(self._horizon(k))
-        self._transforms.send(Pose(stamp_ns, now.x, now.y, now.theta))
+            self._horizon_out.publish(self._horizon(k, held))
+        posture = Pose(stamp_ns, now.x, now.y, now.theta)
+        if self._reference_out is not None:
+            self._reference_out.publish(encode_pose(posture))
+        self._transforms.send(posture)
         self._error_out.publish(encode_error(error, self.settings.frame_prefix))
 
-    def _horizon(self, k: int) -> bytes:
+    def _horizon(self, k: int, held: Posture) -> bytes:
         """Speeds of the reference from step k on, as far as the controller plans."""
-        points = (self.reference[k + ahead] for ahead in range(self.settings.plan_steps + 1))
+        points = (self._reference_at(k + ahead, held) for ahead in range(self.settings.plan_steps + 1))
         ahead = SpeedsAhead(self.grid.stamp(k), tuple((point.v, point.w) for point in points))
         return encode_speeds(ahead, self.grid.ts_ns, self.settings.frame_prefix + FRAME_REFERENCE)
 
     def facts(self) -> dict[str, str]:
-        """Slots that were not answered, by reason; or how the edge's clock and the AGV's get along."""
+        """Slots that were not answered, by reason; or how the edge's clock and the AGV's get along. Paths that came."""
+        paths = {"paths": str(self._paths)} if self.settings.track == PATH else {}
         if self.settings.trigger == TIMER:
             freshest = self._freshest
-            return {
+            return paths | {
                 "clock offset": f"{freshest.offset_ns / NS_PER_S:.6f}",
                 "oldest pose": f"{self._oldest_ns / NS_PER_S:.6f}",
                 "stamps in the future": str(freshest.future),
@@ -234,11 +321,24 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
                 "beginnings": str(freshest.beginnings),
                 "missed steps": str(self._missed),
             }
-        return {
+        return paths | {
             "slots without any pose": str(self._blind),
             "slots whose pose never came": str(self._join.unanswered),
             "outdated messages": str(self._join.outdated),
         }
+
+
+def _points_of(data: bytes) -> list[Point]:
+    """Where a serialised nav_msgs/Path leads [m]. Raises PathError if it is none, or in another frame than `map`."""
+    try:
+        path = deserialize_message(data, Path)
+    except (RuntimeError, ValueError) as error:
+        raise PathError(f"it cannot be read: {error}") from None
+    frames = {path.header.frame_id, *(pose.header.frame_id or FRAME_MAP for pose in path.poses)} - {FRAME_MAP}
+    if frames:
+        found = ", ".join(repr(frame) for frame in sorted(frames))
+        raise PathError(f"it is in frame {found}, poses and paths must be in {FRAME_MAP!r}: let the planner plan there")
+    return [(pose.pose.position.x, pose.pose.position.y) for pose in path.poses]
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -13,20 +13,32 @@ from agv_ros.parameters import LoopParameters, ParameterError, parameter
 
 TRIGGERS = ("slot", "timer")
 
+CSV, PATH = "csv", "path"
+"""Tracks that come from elsewhere: a file, or a topic."""
+
 
 @dataclass(frozen=True)
 class ErrorDetectorParameters(LoopParameters):
     """Parameters of the node `error_detector`."""
 
-    track: str = parameter("paper", "reference track", choices=(*TRACKS, "csv"))
+    track: str = parameter(
+        "paper",
+        "reference track; csv: speeds from track_file, path: along a nav_msgs/Path that comes on edge/path, from its "
+        "beginning to its end, and along each other one that comes after it",
+        choices=(*TRACKS, CSV, PATH),
+    )
     track_file: str = parameter("", "track csv: file with the columns t [s], v [m/s], w [rad/s]")
     track_start: tuple[float, float, float] = parameter(
         (0.0, 0.0, 1.5707963267948966), "X_r(0) = [x, y, theta] in frame map", unit="m, m, rad"
     )
     lap_time: float = parameter(100.0, "time T of one lap of the track", unit="s", above=0.0, high=1e6)
     speed: float = parameter(
-        1.0, "speed of the tracks line, circle, eight and warehouse", unit="m/s", above=0.0, high=100.0
+        1.0, "speed of the tracks line, circle, eight, warehouse and path", unit="m/s", above=0.0, high=100.0
     )
+    corner: float = parameter(
+        0.2, "track path: how far before a corner, at most, the arc begins that rounds it", unit="m", above=0.0,
+        high=100.0,
+    )  # fmt: skip
     policy: str = parameter(
         "hold",
         "what an outdated pose is compared with; hold: the reference of now, align: that of its instant, predict: it "
@@ -55,7 +67,7 @@ class ErrorDetectorParameters(LoopParameters):
 
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
-        if self.track == "csv" and not self.track_file:
+        if self.track == CSV and not self.track_file:
             raise ParameterError("error_detector.track is csv, but error_detector.track_file is empty: name a file")
         if self.lap_time < 16.0 * self.ts:
             raise ParameterError(

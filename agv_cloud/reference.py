@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_cloud.parameters import ErrorDetectorParameters
+from agv_cloud.parameters import CSV, PATH, ErrorDetectorParameters
 from agv_cloud.track_file import load_track
 from agv_cloud.tracks import TRACKS, Speeds
 from agv_plant.unicycle import euler_step
+from agv_ros.errors import UserError
 
 
 class ReferencePoint(NamedTuple):
@@ -29,9 +30,17 @@ class ReferencePoint(NamedTuple):
 
 
 def speeds_of(parameters: ErrorDetectorParameters) -> Callable[[int], Speeds]:
-    """Speeds (v_r, w_r) by step of the track that the parameters name. Raises TrackFileError for a bad file."""
+    """Speeds (v_r, w_r) by step of the track that the parameters name.
+
+    Raises TrackFileError for a bad file, UserError for a track that nobody knows beforehand.
+    """
     ts = parameters.ts
-    if parameters.track == "csv":
+    if parameters.track == PATH:
+        raise UserError(
+            "error_detector.track is path: the reference comes on edge/path while the loop runs, so it is not known "
+            f"here: name another track ({', '.join((*TRACKS, CSV))})"
+        )
+    if parameters.track == CSV:
         profile = load_track(parameters.track_file)
         return lambda k: profile(k * ts)
     track, steps, speed = TRACKS[parameters.track], lap_steps(parameters), parameters.speed

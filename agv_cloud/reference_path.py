@@ -1,8 +1,9 @@
-"""The reference as a path to look at: one lap, thinned, as a latched message for RViz and its like."""
+"""The reference as a path to look at: one lap or a whole path, thinned, as a latched message for RViz and its like."""
 
 from __future__ import annotations
 
 from agv_cloud.parameters import ErrorDetectorParameters
+from agv_cloud.path_track import PathTrack
 from agv_cloud.reference import Reference, ReferencePoint, lap_steps
 
 LONGEST = 50_000
@@ -16,6 +17,10 @@ def path_points(reference: Reference, parameters: ErrorDetectorParameters) -> li
 
     Of a lap of more than 50 000 steps, and of a track from a file beyond `lap_time`, only the beginning.
     """
-    last = min(lap_steps(parameters), LONGEST)
+    return thinned(reference, min(lap_steps(parameters), LONGEST))
+
+
+def thinned(reference: Reference | PathTrack, last: int) -> list[ReferencePoint]:
+    """At most 500 points, evenly spaced, from step 0 to step `last`, and that one."""
     stride = -(-last // (MOST_POINTS - 1))
     return [reference[k] for k in (*range(0, last, stride), last)]

@@ -49,6 +49,8 @@ def command(
     from agv_analysis.recording import read_run
     from agv_analysis.replay import compare as compare_run
     from agv_analysis.replay import with_settings, write_outages
+    from agv_cloud.parameters import PATH
+    from agv_ros.errors import UserError
 
     on_dds = lockstep or rate is not None or edge == "running" or out is not None or not (compare or again or outages)
     _check(lockstep and rate is not None, "--lockstep and --rate exclude each other")
@@ -66,6 +68,11 @@ def command(
             f"outages: {outages}: {lost} of {len(run)} slots lost, the first is step {run.k[0]} of the recording"
         )
     scenario = with_settings(run.scenario, settings)
+    if scenario.error_detector.track == PATH and (again or (on_dds and edge == "own")):
+        raise UserError(
+            f"{bag}: its reference came as paths, which are not in it, so its edge and its run are not had again; "
+            "--compare alone goes by the recorded reference"
+        )
     if again:
         _drive_again(run, scenario, ros, json_file)
     elif on_dds:
