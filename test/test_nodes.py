@@ -19,6 +19,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
@@ -34,6 +35,8 @@ from agv_ros.speeds_wire import SpeedsAhead, encode_speeds
 
 if TYPE_CHECKING:
     from test.conftest import Start
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
 
 NODES: dict[str, type[LoopNode[Any]]] = {
     "agv_plant.plant_node": PlantNode,
@@ -366,21 +369,23 @@ class Robot(Node):
     """Stands in for a robot behind diff_drive_controller, with its conventions and a clock that is not ours.
 
     Odometry in frame `odom` every 100 ms; commands stamped, or not; it halts when the newest is older than 0.5 s by its
-    clock, or has come from the future, and takes one without a stamp for one of now. Source: ros2_controllers,
-    diff_drive_controller (Jazzy), parameters cmd_vel_timeout and use_stamped_vel.
+    clock, or has come from the future, and takes one without a stamp for one of now. With the type of tf2_msgs, or of
+    one in its place, it says on /tf where `base_link` is in `odom`. Source: ros2_controllers, diff_drive_controller
+    (Jazzy), parameters cmd_vel_timeout, use_stamped_vel and enable_odom_tf.
     """
 
     PERIOD = 0.1
     TIMEOUT_NS = 500_000_000
     CLOCK_AHEAD_NS = 3_000_000_000
 
-    def __init__(self, context: Any, is_stamped: bool) -> None:
+    def __init__(self, context: Any, is_stamped: bool, tf_type: Any = None) -> None:
         super().__init__("robot", context=context, use_global_arguments=False)
         self.x = self.y = self.theta = 0.0
         self._command = (0, 0.0, 0.0)
         self._moved_ns = self._now_ns()
         self.halts = self.driven = 0
         self._odometry = self.create_publisher(Odometry, "diff_drive_controller/odom", 10)
+        self._transforms = None if tf_type is None else self.create_publisher(tf_type, "/tf", 100)
         kind, take = (TwistStamped, self._take_stamped) if is_stamped else (Twist, self._take)
         self.create_subscription(kind, "diff_drive_controller/cmd_vel", take, 10)
         self.create_timer(self.PERIOD, self._move)
@@ -412,7 +417,24 @@ class Robot(Node):
         message.pose.pose.orientation.z = math.sin(0.5 * self.theta)
         message.pose.pose.orientation.w = math.cos(0.5 * self.theta)
         message.twist.twist.linear.x, message.twist.twist.angular.z = v, w
+        if self._transforms is not None:
+            self._transforms.publish(self._transform(message))
         self._odometry.publish(message)
+
+    def _transform(self, odometry: Odometry) -> bytes:
+        """The same on /tf, by another library's tf2_msgs."""
+        make = STORE.types
+        time = make["builtin_interfaces/msg/Time"](odometry.header.stamp.sec, odometry.header.stamp.nanosec)
+        turn = odometry.pose.pose.orientation
+        transform = make["geometry_msgs/msg/Transform"](
+            translation=make["geometry_msgs/msg/Vector3"](self.x, self.y, 0.0),
+            rotation=make["geometry_msgs/msg/Quaternion"](0.0, 0.0, turn.z, turn.w),
+        )
+        stamped = make["geometry_msgs/msg/TransformStamped"](
+            header=make["std_msgs/msg/Header"](time, odometry.header.frame_id),
+            child_frame_id=odometry.child_frame_id, transform=transform,
+        )  # fmt: skip
+        return bytes(STORE.serialize_cdr(make["tf2_msgs/msg/TFMessage"]([stamped]), "tf2_msgs/msg/TFMessage"))
 
 
 EDGE_OF_A_ROBOT = {"ts": 0.1, "track": "line", "speed": 0.2, "track_start": [0.0, 0.3, 0.0]}

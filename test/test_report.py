@@ -19,7 +19,7 @@ from agv_analysis.analysis import Analysis, analyse, observe
 from agv_analysis.recording import read_run
 from agv_analysis.report.figures import draw_figures
 from agv_analysis.report.page import render, sentence, write_report
-from agv_analysis.report.panels import LINE, Line, lifted_multipliers, panels, paper_eigenvalues, thinned
+from agv_analysis.report.panels import LINE, Line, lifted_multipliers, panels, paper_eigenvalues, thinned, track
 from agv_analysis.report.sweep import sweep_figure, write_sweep_report
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
@@ -237,6 +237,62 @@ def test_a_hostile_recording_is_text_in_its_report(
     parameters = yaml.safe_load(chromium.find_element("id", "parameters").text)
     assert parameters["error_detector"]["ros__parameters"]["track_file"] == HOSTILE
     assert bad.name in shown
+
+
+def pointed_at(chrome: Chrome, at: int, step: int) -> str:
+    """What the page shows beside the pointer over the place where the pose of this step was lost."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    number = of_plot(chrome, "track", "plot._fullData.findIndex(trace => trace.name == 'pose lost')")
+    of_plot(chrome, "track", f"Plotly.Fx.hover(plot, [{{curveNumber: {number}, pointNumber: {at}}}])")
+    text = "plot.querySelector('.hoverlayer').textContent"  # drawn a moment later
+    WebDriverWait(chrome, 60.0).until(lambda c: f"step {step}, (" in of_plot(c, "track", text))
+    return str(of_plot(chrome, "track", text))
+
+
+def test_a_lost_pose_says_its_step_and_why_it_was_lost(chromium: Chrome, tmp_path: Path) -> None:
+    settings = ("plant.duration=20.0", "relay.uplink.schedule=5: outage=0.05; 5.1: outage=0")
+    run = simulate(scenario_of(*settings))
+    assert run.uplink is not None
+    lost = np.flatnonzero(run.lost)
+    write_report(analyse(run), tmp_path / "lost.html")
+    show(chromium, tmp_path / "lost.html")
+    for cause in ("gilbert_elliott", "outage"):
+        at = int(np.flatnonzero(run.uplink.cause[lost] == cause)[0])
+        said = pointed_at(chromium, at, run.k[lost[at]])
+        assert said.endswith(f"cause: {cause}"), said
+    assert complaints(chromium) == []
+
+
+@pytest.mark.parametrize(
+    "causes",
+    [[HOSTILE], [HOSTILE, "<a href='javascript:window.harm=1'>x</a>", "%{x}<b>", "", "\x01", "a" * 5000, "&lt;"]],
+    ids=["one", "several"],
+)
+def test_a_hostile_cause_is_text_beside_the_pointer(chromium: Chrome, tmp_path: Path, causes: list[str]) -> None:
+    run = read_run(SAMPLE)
+    assert run.uplink is not None
+    lost, said = np.flatnonzero(run.lost), np.full(len(run), "", dtype="<U5000")
+    said[lost] = np.resize(causes, len(lost))
+    bad = dataclasses.replace(run, uplink=dataclasses.replace(run.uplink, cause=said))
+    write_report(analyse(bad), tmp_path / "bad.html")
+    show(chromium, tmp_path / "bad.html")
+    for at, cause in enumerate(causes):
+        shown = pointed_at(chromium, at, run.k[lost[at]])
+        assert f"cause: {cause[:60] or 'not recorded'}" in shown, shown
+        assert of_plot(chromium, "track", "plot.querySelectorAll('.hoverlayer a').length") == 0
+    assert chromium.execute_script("return [typeof window.harm, document.images.length]") == ["undefined", 0]
+    assert complaints(chromium) == []
+
+
+def test_without_a_word_of_the_causes_the_steps_are_there() -> None:
+    run = dataclasses.replace(read_run(SAMPLE), uplink=None)
+    line = track(run).lines[-1]
+    few = thinned(line, 20)
+    assert few.slots is not None
+    rows = np.searchsorted(run.k, few.slots.k)
+    np.testing.assert_array_equal(run.pose[rows, :2], np.column_stack([few.x, few.y]))
+    assert set(few.slots.cause.tolist()) == {""}
 
 
 def test_what_turns_letters_round_ends_where_it_began(chromium: Chrome, tmp_path: Path) -> None:

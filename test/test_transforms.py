@@ -7,6 +7,8 @@ by the definition of tf2_msgs/TFMessage.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib
 import os
 import sys
 from collections.abc import Callable
@@ -17,13 +19,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from agv_analysis.other_robots import RobotTopics, read_robot_run
+from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_cloud.reference import Reference
 from agv_ros.transforms import TOPIC
-from agv_ros.wire import Pose, decode_pose, encode_transform
+from agv_ros.wire import Pose, decode_odometry, decode_pose, encode_transform
 
 REPOSITORY = Path(__file__).parents[1]
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -144,6 +149,80 @@ def test_whoever_listens_gets_both_frames(of_another_type: None, prefix: str) ->
     assert off == []
     off = [k for k in wanted if not _close(wanted[k], reference[scenario.grid.step(k)][:3])]
     assert off == []
+
+
+@pytest.fixture(params=["tf2_msgs", "another type"])
+def tf_type(request: pytest.FixtureRequest) -> Any:
+    """The type of /tf: the real one where it is installed, and one in its place."""
+    if request.param == "tf2_msgs":
+        return pytest.importorskip("tf2_msgs.msg", reason="needs tf2_msgs, which only ROS 2 itself has").TFMessage
+    request.getfixturevalue("of_another_type")
+    return importlib.import_module("tf2_msgs.msg").TFMessage
+
+
+def test_another_robot_s_transform_goes_beside_ours_and_disturbs_no_analysis(tf_type: Any, tmp_path: Path) -> None:
+    from nav_msgs.msg import Odometry
+
+    from agv_cloud.error_detector_node import ErrorDetectorNode
+    from agv_ros.node import LOOP_QOS
+    from test.test_nodes import EDGE_OF_A_ROBOT, ROBOT_S_TOPICS, Bench, Robot
+
+    bench, heard = Bench("events"), []
+
+    def note(topic: str, kind: str) -> Callable[[bytes], None]:
+        return lambda data: heard.append((topic, kind, bytes(data)))
+
+    odometry, tf = ("/diff_drive_controller/odom", "nav_msgs/msg/Odometry"), ("/tf", "tf2_msgs/msg/TFMessage")
+    bench.probe.create_subscription(Odometry, odometry[0], note(*odometry), LOOP_QOS, raw=True)
+    bench.probe.create_subscription(tf_type, tf[0], note(*tf), LOOP_QOS, raw=True)
+    robot = Robot(bench.context, True, tf_type)
+    bench.executor.add_node(robot)
+    bench.nodes.append(robot)
+    parameters = {"trigger": "timer", "begin": "first_pose", "pose_type": "odometry"} | EDGE_OF_A_ROBOT
+    bench.add(functools.partial(ErrorDetectorNode, cli_args=["--ros-args", *ROBOT_S_TOPICS]), **parameters)
+
+    def places() -> dict[str, dict[int, Any]]:
+        """What each pair of frames has, by stamp."""
+        found: dict[str, dict[int, Any]] = {}
+        for topic, _, data in heard:
+            if topic == tf[0]:
+                one = decoded(data)
+                frames = f"{one.header.frame_id} {one.child_frame_id}"
+                found.setdefault(frames, {})[stamp_of(one)] = place(one)
+        return found
+
+    try:
+        bench.until(lambda: len(places().get("odom base_link", ())) > 5 and "map reference" in places())
+    finally:
+        bench.close()
+    assert set(places()) == {"odom base_link", "map reference"}
+    sent = [decode_odometry(data) for topic, _, data in heard if topic == odometry[0]]
+    seen = places()["odom base_link"]
+    assert [pose.stamp_ns for pose in sent if pose.stamp_ns in seen and not _close(seen[pose.stamp_ns], pose[1:])] == []
+    runs: list[Run] = []
+    for kept in ([*heard], [message for message in heard if message[0] != tf[0]]):
+        bag = tmp_path / f"bag_{len(runs)}"
+        write(bag, kept)
+        runs.append(read_robot_run(bag, RobotTopics(odometry[0]), None, config_of(tmp_path)))
+    for name in ("k", "pose", "reference", "lost", "n_ul"):
+        np.testing.assert_array_equal(getattr(runs[0], name), getattr(runs[1], name), name)
+    assert runs[0].notes == runs[1].notes
+
+
+def write(bag: Path, messages: list[tuple[str, str, bytes]]) -> None:
+    """A bag of serialised messages, one a millisecond."""
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for number, (topic, kind, data) in enumerate(messages):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], NS + number * 1_000_000, data)
+
+
+def config_of(folder: Path) -> Path:
+    path = folder / "line.yaml"
+    path.write_text("error_detector: {ros__parameters: {track: line, speed: 0.2, track_start: [0.0, 0.3, 0.0]}}\n")
+    return path
 
 
 def _close(found: tuple[float, float, float], expected: tuple[float, ...]) -> bool:

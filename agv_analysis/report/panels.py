@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,14 @@ LARGEST_LIFTED = 600
 _EIGENVALUE_STEPS = 400
 
 
+class Slots(NamedTuple):
+    """Steps, and for what each of them lost its message; shapes (M,)."""
+
+    k: NDArray[np.int64]
+    cause: NDArray[np.str_]
+    """Empty where nobody has written it down."""
+
+
 @dataclass(frozen=True)
 class Line:
     """One line of a panel; x and y of equal length, NaN where nothing is drawn."""
@@ -38,6 +46,8 @@ class Line:
     y: Floats
     role: str
     style: str = LINE
+    slots: Slots | None = None
+    """The slot behind each point, where there is one."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +84,12 @@ def track(run: Run) -> Panel:
     """The track from above, with the places where poses were lost."""
     reference = run.reference[:, :2]
     x, y = within(run.pose[:, 0], reference[:, 0]), within(run.pose[:, 1], reference[:, 1])
+    cause = np.full(len(run), "") if run.uplink is None else run.uplink.cause
+    why = Slots(run.k[run.lost], cause[run.lost])
     lines = (
         Line("reference", reference[:, 0], reference[:, 1], REFERENCE),
         Line("AGV", x, y, DRIVEN),
-        Line("pose lost", x[run.lost], y[run.lost], LOST, DOTS),
+        Line("pose lost", x[run.lost], y[run.lost], LOST, DOTS, why),
     )
     return Panel("track", "Track", "x [m]", "y [m]", lines[: 3 if run.lost.any() else 2], equal=True)
 
@@ -213,7 +225,8 @@ def thinned(line: Line, most: int) -> Line:
     lowest = begins + np.where(blank, np.inf, stretches).argmin(axis=1)
     highest = begins + np.where(blank, -np.inf, stretches).argmax(axis=1)
     kept = np.unique(np.concatenate((lowest, highest, [0, len(line.x) - 1])))
-    return replace(line, x=line.x[kept], y=line.y[kept])
+    slots = None if line.slots is None else Slots(*(part[kept] for part in line.slots))
+    return replace(line, x=line.x[kept], y=line.y[kept], slots=slots)
 
 
 def to_json(panel: Panel, most: int) -> dict[str, Any]:

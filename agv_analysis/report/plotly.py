@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 import base64
+import html
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from agv_analysis.report.panels import BARS, DOTS, DRIVEN, LIMIT, LOST, OTHER, REFERENCE, STEP, Line, Panel, thinned
+from agv_analysis.report.panels import (
+    BARS,
+    DOTS,
+    DRIVEN,
+    LIMIT,
+    LOST,
+    OTHER,
+    REFERENCE,
+    STEP,
+    Line,
+    Panel,
+    Slots,
+    thinned,
+)
 from agv_analysis.run import Floats
 
 COLOURS = {REFERENCE: "#8a8a8a", DRIVEN: "#3b8bd0", LOST: "#e0453c", OTHER: "#e39a2d", LIMIT: "#8a8a8a"}
@@ -19,6 +34,9 @@ MOST_POINTS = 20_000
 
 _LINE_PER_DOT = 4
 """A point that is drawn by itself, an element of the page, takes as long as so many points of a line."""
+
+_LONGEST_CAUSE = 60
+"""Letters of a cause that are shown, at most."""
 
 _GAP = 0.22
 """Share of a row that is left free above it, for its legend."""
@@ -72,14 +90,32 @@ def _trace(line: Line, most: int) -> dict[str, Any]:
         return {**trace, "type": "bar", "marker": {"color": colour}}
     trace["type"] = "scatter"
     if line.style == DOTS:
-        return {**trace, "mode": "markers", "marker": {"color": colour, "size": 4}}
+        why = {} if line.slots is None else _why(line.slots)
+        return {**trace, "mode": "markers", "marker": {"color": colour, "size": 4}, **why}
     dash = {"dash": "dash"} if line.role == LIMIT else {}
     shape = {"shape": "hv"} if line.style == STEP else {}
     return {**trace, "mode": "lines", "line": {"color": colour, "width": 1.5, **dash, **shape}}
 
 
+def _why(slots: Slots) -> dict[str, Any]:
+    """What is shown of a slot under the pointer: its step and why its message was lost.
+
+    plotly.js takes some tags and `%{` in a text for its own, so none is left in a cause, which is another's word.
+    """
+    said, of = np.unique(slots.cause, return_inverse=True)
+    causes = [html.escape(cause[:_LONGEST_CAUSE]).replace("%", "&#37;") or "not recorded" for cause in said.tolist()]
+    place = "step %{customdata}, (%{x:.3f}, %{y:.3f}) m<br>cause: "
+    steps = {"customdata": _binary(slots.k.astype("<f8"), "f8")}
+    if len(causes) == 1:
+        return {**steps, "hovertemplate": place + causes[0]}
+    return {**steps, "text": [causes[i] for i in of.tolist()], "hovertemplate": place + "%{text}"}
+
+
 def _packed(values: Floats) -> dict[str, str]:
     """Numbers as plotly.js takes them in binary, in single precision, which is finer than a pixel."""
     largest = float(np.finfo(np.float32).max)
-    single = np.clip(values, -largest, largest).astype("<f4")
-    return {"dtype": "f4", "bdata": base64.b64encode(single.tobytes()).decode("ascii")}
+    return _binary(np.clip(values, -largest, largest).astype("<f4"), "f4")
+
+
+def _binary(values: NDArray[Any], dtype: str) -> dict[str, str]:
+    return {"dtype": dtype, "bdata": base64.b64encode(values.tobytes()).decode("ascii")}
