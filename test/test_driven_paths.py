@@ -181,6 +181,25 @@ def test_what_is_no_path_is_refused(bench: Bench) -> None:
     assert edge.step(0, 1.0) == (1.0, 0.0, 0.0, 0.0)
 
 
+def test_an_edge_with_a_clock_of_its_own_drives_a_path_too(bench: Bench) -> None:
+    edge = bench.add(
+        ErrorDetectorNode, track="path", trigger="timer", begin="first_pose", ts=0.02, pose_type="odometry"
+    )
+    paths = bench.publisher(PathMessage, "edge/path")
+    errors, references = bench.received(Odometry, "edge/error"), bench.received(PoseStamped, "edge/reference_pose")
+    odometry, there = bench.publisher(Odometry, "edge/pose"), Odometry()
+    there.header.stamp.sec, there.pose.pose.position.x, there.pose.pose.orientation.w = 1_700_000_000, 3.0, 1.0
+    odometry.publish(there)
+    bench.until(lambda: len(references) > 5)
+    assert {(place.pose.position.x, place.pose.position.y) for place in references} == {(3.0, 0.0)}
+    assert {error.twist.twist.linear.x for error in errors} == {0.0}
+    paths.publish(path_of([(3.0, 0.0), (3.0, 0.1)]))
+    bench.until(lambda: references[-1].pose.position.y == pytest.approx(0.1))
+    assert edge.facts()["paths"] == "1"
+    bench.until(lambda: errors[-1].twist.twist.linear.x == 0.0 and len(errors) > 8)
+    assert max(error.twist.twist.linear.x for error in errors) == pytest.approx(1.0)
+
+
 # -- whole runs -------------------------------------------------------------------------------------------------------
 
 
