@@ -621,7 +621,7 @@ def test_a_node_that_is_started_again_in_an_outage_that_does_not_end_is_spoken_o
     detector = start("agv_cloud.error_detector_node")
     for topic in ("edge/slot", "edge/error", "edge/cmd_vel"):
         lone_bench.until(functools.partial(lone_bench.probe.count_publishers, topic))
-    plant = start("agv_plant.plant_node", "--ros-args", "-p", "duration:=.inf", "-p", "answer_timeout:=3.0")
+    plant = start("agv_plant.plant_node", "--ros-args", "-p", "duration:=.inf", "-p", "answer_timeout:=8.0")
     plant.wait_for("step 2000 of")
     start("agv_cloud.error_detector_node")
     lone_bench.until(lambda: lone_bench.probe.count_publishers("edge/error") == 2)
