@@ -211,10 +211,12 @@ def _reference(on_steps: Mapping[str, OnSteps], k: Steps, scenario: Scenario, so
 def _verdicts(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[np.bool_], LinkSlots]:
     """Age n(k) in steps of what is held behind a channel, whether slot k was lost, and why; shapes (N,).
 
-    Where there is no slot, or nothing has been received yet, the age is the number of steps since step 0.
+    A relay that was started again names no message before it has passed one on; what was held before still is. Where
+    nothing has been received yet, the age is the number of steps since step 0.
     """
     index, there = slots.at(k)
     held_ns = np.where(there, _stamps(slots.messages, "time_ref")[index], 0)
+    held_ns = np.where(held_ns > 0, held_ns, np.maximum.accumulate(held_ns))
     age = np.where(held_ns > 0, k - (held_ns - grid.start_ns) // grid.ts_ns, k)
     source = slots.messages["source"][index]
     lost = there & (source != DELIVERED.encode()) & (source != DELAYED.encode())

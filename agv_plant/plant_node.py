@@ -212,7 +212,7 @@ class PlantNode(LoopNode[PlantParameters]):
                     known = self._peers()
                 seen, since = self.k, now
             elif now - since > self.settings.answer_timeout:
-                self.fail(self._no_answer(known))
+                self.fail(self._no_answer())
             elif now - max(since, repeated) > patience and self._pose_out.count and self._may_be_lost(known):
                 repeated = now
                 self._pose_out.publish(encode_pose(self._measured_pose()))
@@ -232,18 +232,15 @@ class PlantNode(LoopNode[PlantParameters]):
         peers = self._peers()
         return self.k == 0 or (peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 
-    def _no_answer(self, known: frozenset[tuple[str, bytes]]) -> str:
+    def _no_answer(self) -> str:
         silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)
         if silent == "relay" and self.count_publishers("agv/slot"):  # the edge has a domain of its own
             silent = "edge, with error_detector and controller,"
-        if silent:
-            question = f"is the {silent} running?"
-        elif self.k and self._peers() != known:
-            question = "a node was started again and knows no earlier pose: was that of this step lost, or is it late?"
-        else:
-            question = (
-                "all nodes are there: do they have the same ts and start_time, and does each hear the one before it?"
-            )
+        question = (
+            f"is the {silent} running?"
+            if silent
+            else "all nodes are there: do they have the same ts and start_time, and does each hear the one before it?"
+        )
         return f"no answer to step {self.k} on agv/cmd_vel within {self.settings.answer_timeout:g} s: {question}"
 
     # -- realtime ----------------------------------------------------------------------------------------------------

@@ -207,13 +207,17 @@ class Link:
 
     Theory of operation. A slot is taken by the message of its step. What is not lost joins those under way, once or
     twice, with its instant of arrival; then all arrive that are due, in the order of these instants. So the slot says
-    what the receiver holds after them, and both are functions of the stamps alone.
+    what the receiver holds after them, and both are functions of the stamps alone. A message that is sent again at once
+    has the same verdict; if it is lost, the freshest one that has come through comes again, for a receiver that was
+    started again meanwhile and has forgotten it.
     """
 
     def __init__(self, channel: Channel, grid: Grid, keeps_to_grid: bool = True) -> None:
         self.channel = channel
         self._steps = Steps(grid) if keeps_to_grid else NearestSteps(grid.ts_ns)
         self._freshest_ns = 0
+        self._freshest: list[bytes] = []
+        self._sent_ns = -1
         self._under_way: list[tuple[int, float, int, int, bytes]] = []
         self._order = 0
         self.sent = 0
@@ -235,7 +239,7 @@ class Link:
         """
         k = self._steps.of(stamp_ns)
         if k == 0:  # begins a run: whatever is held or under way of a run before it is past
-            self._freshest_ns, self._under_way = 0, []
+            self._freshest_ns, self._freshest, self._under_way = 0, [], []
         verdict = self.channel.judge(k, *place)
         wait = 0 if verdict.lost else self._send(k, stamp_ns, message)
         self._count(verdict, wait)
@@ -243,7 +247,11 @@ class Link:
         while self._under_way and self._under_way[0][0] <= k:
             *_, sent_ns, data = heapq.heappop(self._under_way)
             arrived.append(data)
-            self._freshest_ns = max(self._freshest_ns, sent_ns)
+            if sent_ns >= self._freshest_ns:
+                self._freshest_ns, self._freshest = sent_ns, [data]
+        is_again, self._sent_ns = stamp_ns == self._sent_ns, stamp_ns
+        if is_again and not arrived:
+            arrived = [*self._freshest]
         said = LOST if verdict.lost else DELAYED if wait else DELIVERED
         return Passage(Slot(stamp_ns, self._freshest_ns, said, self._note(verdict, wait)), arrived)
 

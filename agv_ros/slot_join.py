@@ -7,7 +7,8 @@ node computes depends on stamps alone, never on the order of arrival. The error 
 the plant in lockstep commands with downlink slots: this join is the barrier that makes the loop deterministic.
 
 Each topic keeps its order, so step 0 parts one run from the next on either side: its message from the messages before
-it, its slot from the slots before it, whichever of the two comes first.
+it, its slot from the slots before it, whichever of the two comes first. A relay that was started again in between does
+not know what it has passed on before, and names no message: then what the receiver holds is the freshest.
 
 No clock, no thread, no ROS in here: messages go in, pairs that are complete come out.
 """
@@ -89,6 +90,8 @@ class SlotJoin(Generic[M]):
         elif slot.stamp_ns < self._last_slot_ns:
             self.outdated += 1
             return []
+        elif slot.freshest_ns == 0 and self._held is not None:
+            slot = slot._replace(freshest_ns=self._waiting[-1].freshest_ns if self._waiting else self._settled_ns)
         self._waiting.append(slot)
         return self._complete()
 

@@ -109,6 +109,15 @@ def test_before_the_first_delivery_nothing_is_held() -> None:
     assert [radio.transmit(GRID.stamp(k)).slot.freshest_ns for k in (3, 4, 8)] == [0, 0, GRID.stamp(8)]
 
 
+def test_what_is_sent_again_in_an_outage_brings_the_freshest_again() -> None:
+    radio = link(ChannelParameters(model="burst", n=5, start_step=3))
+    arrived = [radio.transmit(GRID.stamp(k), str(k).encode()).arrived for k in (0, 1, 2, 3, 4, 4, 4, 5, 5)]
+    assert arrived == [[b"0"], [b"1"], [b"2"], [], [], [b"2"], [b"2"], [], [b"2"]]
+    late = link(ChannelParameters(delay=0.01))
+    arrived = [late.transmit(GRID.stamp(k), str(k).encode()).arrived for k in (0, 1, 1, 2, 3)]
+    assert arrived == [[b"0"], [], [b"0"], [], [b"1", b"1"]]
+
+
 def test_a_second_run_has_the_same_verdicts_and_holds_nothing_of_the_first() -> None:
     radio = link(ChannelParameters(model="bernoulli", p=0.5))
     first, second = ([radio.transmit(GRID.stamp(k)) for k in range(100)] for _ in range(2))

@@ -220,3 +220,19 @@ def test_a_dead_topic_does_not_let_the_other_fill_the_memory() -> None:
     last = MOST_WAITING + 49
     assert [one.slot.stamp_ns for one in slots_only.add_message(Message(t(last)))] == [t(last)]
     assert [one.message for one in messages_only.add_slot(Slot(t(60), t(60), DELIVERED))] == [Message(t(60))]
+
+
+def test_a_relay_that_was_started_again_leaves_what_is_held() -> None:
+    """It names no message before it has passed one on."""
+    join: SlotJoin[Message] = SlotJoin(START)
+    assert join.add_slot(Slot(t(0), 0, LOST)) == [Joined(Slot(t(0), 0, LOST), None)]
+    join.add_message(Message(t(1)))
+    join.add_slot(Slot(t(1), t(1), DELIVERED))
+    (joined,) = join.add_slot(Slot(t(2), 0, LOST))
+    assert (joined.slot.stamp_ns, joined.message) == (t(2), Message(t(1)))
+    assert join.add_slot(Slot(t(3), t(3), DELIVERED)) == []
+    assert join.add_slot(Slot(t(4), 0, LOST)) == []  # step 3's message is under way
+    assert [(j.slot.stamp_ns, j.message) for j in join.add_message(Message(t(3)))] == [
+        (t(3), Message(t(3))), (t(4), Message(t(3))),
+    ]  # fmt: skip
+    assert (join.outdated, join.unanswered) == (0, 0)
