@@ -161,6 +161,18 @@ def test_a_recording_that_begins_and_ends_in_the_middle_is_whole(tmp_path: Path)
     assert (run.k[0], run.k[-1]) == (302, 900)
 
 
+def test_a_relay_that_was_started_again_and_names_no_pose_makes_none_older(tmp_path: Path) -> None:
+    def forgotten(topic: str, k: int, data: bytes) -> list[bytes]:
+        if topic != "/edge/slot" or k < 1000 or decode_slot(data).verdict != LOST:
+            return [data]
+        return [encode_slot(decode_slot(data)._replace(freshest_ns=0))]
+
+    whole, run = read_run(SAMPLE), read_run(changed_bag(tmp_path / "bag.mcap", forgotten))
+    assert whole.lost[1000:].any()
+    np.testing.assert_array_equal(run.n_ul, whole.n_ul)
+    assert run.notes == whole.notes
+
+
 def test_messages_that_come_twice_count_once_and_are_mentioned(tmp_path: Path) -> None:
     run = read_run(changed_bag(tmp_path / "bag.mcap", lambda topic, k, data: [data] * (1 + (k == 5))))
     assert len(run) == 2000
