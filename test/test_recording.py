@@ -170,7 +170,7 @@ def test_a_relay_that_was_started_again_and_names_no_pose_makes_none_older(tmp_p
     whole, run = read_run(SAMPLE), read_run(changed_bag(tmp_path / "bag.mcap", forgotten))
     assert whole.lost[1000:].any()
     np.testing.assert_array_equal(run.n_ul, whole.n_ul)
-    assert run.notes == whole.notes
+    assert not [note for note in run.notes if "do not fit" in note]
 
 
 def test_messages_that_come_twice_count_once_and_are_mentioned(tmp_path: Path) -> None:
