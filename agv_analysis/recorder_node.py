@@ -47,6 +47,9 @@ TOPICS: dict[str, type] = {
 }
 """What is recorded. The loop's names are relative: a recorder records the loop of its own namespace."""
 
+_DIAGNOSTICS = list(TOPICS).index("/diagnostics")
+"""Its number; a fleet's recorders know it under other names."""
+
 
 class RecorderNode(LoopNode[RecorderParameters]):
     """Writes raw messages and holds the count against what the nodes say that they have published."""
@@ -92,7 +95,7 @@ class RecorderNode(LoopNode[RecorderParameters]):
             record(data)
             self._note(deserialize_message(data, DiagnosticArray))
 
-        return record_diagnostics if self._names[number] == "/diagnostics" else record
+        return record_diagnostics if number == _DIAGNOSTICS else record
 
     def _describer(self, topic: str, kind: type, sides: Sequence[Node]) -> Callable[[], TopicInfo]:
         module = kind.__module__.split(".")

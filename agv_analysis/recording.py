@@ -48,11 +48,14 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     bag = read_bag(path, topics=())
     names = loop_topics(bag, path, namespace)
     scenario = _scenario(bag, path, config)
-    bag = read_bag(path, topics=(*names.values(), restarts.TOPIC))
+    namespace = names["agv/pose"].removesuffix("agv/pose")
+    own = f"{namespace}diagnostics"  # of a vehicle of a fleet
+    diagnostics = own if own in bag.topics else restarts.TOPIC
+    bag = read_bag(path, topics=(*names.values(), diagnostics))
     run = _run(bag, names, scenario, str(path))
-    if restarts.TOPIC not in bag.topics:
+    if diagnostics not in bag.topics:
         return run
-    again = restarts.restarts(bag[restarts.TOPIC], names["agv/pose"].removesuffix("agv/pose"), scenario.grid)
+    again = restarts.restarts(bag[diagnostics], namespace, scenario.grid)
     return dataclasses.replace(run, notes=(*run.notes, *again))
 
 

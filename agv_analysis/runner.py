@@ -1,4 +1,4 @@
-"""Running a whole scenario on DDS: all nodes in this process, or one process for each."""
+"""Running a whole scenario on DDS, or a fleet of them: all nodes in this process, or one process for each."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+import click
 import rclpy
 import rclpy.logging
 from rclpy.executors import Executor
@@ -28,10 +29,10 @@ from agv_analysis.parameters import RecorderParameters
 from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.replay import EdgeInputs
 from agv_analysis.replay_node import Pace, ReplayNode, ReplayRecorder
-from agv_analysis.scenario import SCHEMAS, Scenario
+from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
-from agv_plant.plant_node import PlantNode, progress_of
+from agv_plant.plant_node import PlantNode, progress_line, progress_of
 from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
 from agv_ros.errors import UserError
@@ -70,8 +71,14 @@ _STOP_TIMEOUT = 20.0
 _LOOK_PERIOD = 0.1
 """How often [s] the processes are looked at while they run."""
 
-_STEPS_PER_LOOK = 64
-"""How many steps pass between two calls of `progress`."""
+_EVENTS_PER_LOOK = 256
+"""How many events pass between two calls of `progress`."""
+
+_SAY_PERIOD = 0.2
+"""How often [s] a vehicle's process says how far it is."""
+
+_OWN_TOPICS = ["--ros-args", "-r", "/clock:=clock", "-r", "/diagnostics:=diagnostics"]
+"""What makes of the topics of all nodes those of a namespace: each vehicle of a fleet has a clock of its own."""
 
 _LOG_PREFIX = re.compile(r"^\[[A-Z]+\] \[[0-9.]+\] \[[^]]*\]: ")
 """What rclpy's logging puts before a line: severity, time, node."""
@@ -100,17 +107,40 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
 
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
-    connected = _connected(scenario, recorded=bag is not None)
-    with stop_on_signals() as stop, _params_file(scenario) as params, OneProcess() as process:
-        plant = process.add(PlantNode, connected.plant, domain_id=connected.domain_of("plant"))
-        rclpy.logging.set_logger_level("plant", rclpy.logging.LoggingSeverity.WARN)  # its Outcome says the same
-        others = [name for name in SCHEMAS if name != "plant"]
-        loop = [
-            plant,
-            *(process.add(NODES[n], getattr(connected, n), domain_id=connected.domain_of(n)) for n in others),
+    with stop_on_signals() as stop, OneProcess() as process:
+        loop = _loop_in(process, scenario, bag)
+        return run_loops(EXECUTORS[executor](context=process.context), [loop], stop, progress)[0]
+
+
+def run_fleet(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress) -> list[Outcome]:
+    """Run scenarios beside each other in this process, each in the namespace that is its name and with its own bag.
+
+    A vehicle that fails does not end the others. Raises UserError as `run_in_process` does.
+    """
+    with stop_on_signals() as stop, OneProcess() as process:
+        loops = [
+            _loop_in(process, scenario, None if bag is None else bag / name, name) for name, scenario in fleet.items()
         ]
-        recorder = None if bag is None else process.add_recorder(_recording(scenario, bag, params), RecorderNode)
-        return run_nodes(EXECUTORS[executor](context=process.context), plant, loop, recorder, stop, progress)
+        return run_loops(EXECUTORS["events"](context=process.context), loops, stop, progress)
+
+
+def _loop_in(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: str = "") -> Loop:
+    """The nodes of a scenario, in a namespace if they are a vehicle of a fleet."""
+    connected = _connected(scenario, recorded=bag is not None)
+    if vehicle:  # what nodes have to say beside warnings is in the fleet's table
+        rclpy.logging.set_logger_level(vehicle, rclpy.logging.LoggingSeverity.WARN)
+    plant = process.add(PlantNode, connected.plant, domain_id=connected.domain_of("plant"), vehicle=vehicle)
+    plant.get_logger().set_level(rclpy.logging.LoggingSeverity.WARN)  # its Outcome says the same
+    others = [
+        process.add(NODES[name], getattr(connected, name), domain_id=connected.domain_of(name), vehicle=vehicle)
+        for name in SCHEMAS
+        if name != "plant"
+    ]
+    with _params_file(scenario) as params:
+        recorder = (
+            None if bag is None else process.add_recorder(_recording(scenario, bag, params), RecorderNode, vehicle)
+        )
+    return Loop(plant, [plant, *others], recorder)
 
 
 def replay_in_process(
@@ -139,7 +169,7 @@ def replay_in_process(
             player.recorder = process.add_recorder(_recording(scenario, bag, params), make)
             player.recorder.player = player
         executor = EXECUTORS["events"](context=process.context)
-        outcome = run_nodes(executor, player, nodes, player.recorder, stop, progress)
+        outcome = run_loops(executor, [Loop(player, nodes, player.recorder)], stop, progress)[0]
         return outcome, player.errors, player.commands
 
 
@@ -164,58 +194,94 @@ class OneProcess:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def add(self, make: Callable[..., N], settings: object, use_sim_time: bool = False, domain_id: int = -1) -> N:
-        """Make a node with these settings, in a DDS domain of its own if it is to have one."""
+    def add(
+        self, make: Callable[..., N], settings: object, use_sim_time: bool = False, domain_id: int = -1,
+        vehicle: str = "",
+    ) -> N:  # fmt: skip
+        """Make a node with these settings, in a DDS domain of its own if it is to have one.
+
+        The nodes of a `vehicle` of a fleet have this namespace, and in it clock and diagnostics of their own.
+        """
         if domain_id >= 0 and domain_id not in self._contexts:
             self._enter_domain(rclpy.Context(), domain_id)
         node = make(
             parameter_overrides=[*overrides(settings), Parameter("use_sim_time", value=use_sim_time)],
-            context=self._contexts.get(domain_id, self.context), use_global_arguments=False, namespace=self._namespace,
+            context=self._contexts.get(domain_id, self.context), use_global_arguments=False,
+            namespace=vehicle or self._namespace, cli_args=_OWN_TOPICS if vehicle else None,
         )  # fmt: skip
         self._stack.callback(node.destroy_node)
         return node
 
-    def add_recorder(self, settings: RecorderParameters, make: Callable[..., R]) -> R:
+    def add_recorder(self, settings: RecorderParameters, make: Callable[..., R], vehicle: str = "") -> R:
         """Make a recorder, which says in the run's Outcome alone what it has recorded."""
-        rclpy.logging.set_logger_level("recorder", rclpy.logging.LoggingSeverity.WARN)
-        return self.add(make, settings)
+        recorder = self.add(make, settings, vehicle=vehicle)
+        recorder.get_logger().set_level(rclpy.logging.LoggingSeverity.WARN)
+        return recorder
 
 
-def run_nodes(
-    executor: Executor,
-    plant: PlantNode | ReplayNode,
-    loop: Sequence[LoopNode[Any]],
-    recorder: RecorderNode | None,
-    stop: Stop,
-    progress: Progress,
-) -> Outcome:
-    """Run the nodes of a loop until the one that says when a step is over, plant or player, has done all steps."""
-    for node in loop if recorder is None else (*loop, recorder):
-        add(executor, node)
-    pace = _Pace()
+class Loop(NamedTuple):
+    """The nodes of one loop."""
 
-    def is_done() -> bool:
-        if plant.k % _STEPS_PER_LOOK == 1:
-            pace.see(plant.k)
-            progress(plant.k)
-        return plant.finished or stop.requested
+    plant: PlantNode | ReplayNode
+    """The one that says when a step is over."""
+    nodes: Sequence[LoopNode[Any]]
+    """All of them but the recorder."""
+    recorder: RecorderNode | None
 
+    def outcome(self, rate: float, stopped: bool) -> Outcome:
+        """How it ended."""
+        plant, recorder = self.plant, self.recorder
+        failure = plant.failure or (f"interrupted at step {plant.k}" if stopped and not plant.finished else "")
+        recorded = (recorder.summary, recorder.failure) if recorder else ("", "")
+        return Outcome(plant.k, rate, failure, *recorded)
+
+
+def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: Progress) -> list[Outcome]:
+    """Run loops until all have done all their steps; `progress` is told of the steps of all of them together."""
+    for loop in loops:
+        for node in (*loop.nodes, loop.recorder) if loop.recorder else loop.nodes:
+            add(executor, node)
+    watch = _Watch(loops, stop, progress)
     try:
-        spin(executor, is_done)
-        pace.see(plant.k)
-        progress(plant.k)
-    finally:  # whatever ended the loop, what was recorded is kept
-        for node in loop:
-            node.close()
-            node.flush(_PATIENCE)
-        if recorder is not None:
-            spin_for(executor, recorder.is_settled, _PATIENCE)
+        spin(executor, watch.is_done)
+        watch.look()
+    finally:  # whatever ended the loops, what was recorded is kept
+        for loop in loops:
+            for node in loop.nodes:
+                node.close()
+                node.flush(_PATIENCE)
+        recorders = [loop.recorder for loop in loops if loop.recorder]
+        spin_for(executor, lambda: all(recorder.is_settled() for recorder in recorders), _PATIENCE)
+        for recorder in recorders:
             recorder.close()
         executor.shutdown()
-    failure = plant.failure or (f"interrupted at step {plant.k}" if stop.requested else "")
-    return Outcome(
-        plant.k, pace.rate, failure, recorder.summary if recorder else "", recorder.failure if recorder else ""
-    )
+    return [loop.outcome(pace.rate, stop.requested) for loop, pace in zip(loops, watch.paces, strict=True)]
+
+
+class _Watch:
+    """Looks at loops while they run."""
+
+    def __init__(self, loops: Sequence[Loop], stop: Stop, progress: Progress) -> None:
+        self._plants = [loop.plant for loop in loops]
+        self._unfinished = list(self._plants)
+        self._stop, self._progress = stop, progress
+        self._asked = 0
+        self.paces = [_Pace() for _ in loops]
+
+    def is_done(self) -> bool:
+        """Have all loops ended, or is all to stop? Asked after each event."""
+        self._asked += 1
+        if self._asked % _EVENTS_PER_LOOK == 0:
+            self.look()
+        while self._unfinished and self._unfinished[-1].finished:  # one is looked at, for one is enough
+            self._unfinished.pop()
+        return not self._unfinished or self._stop.requested
+
+    def look(self) -> None:
+        """See how far each is."""
+        for plant, pace in zip(self._plants, self.paces, strict=True):
+            pace.see(plant.k)
+        self._progress(sum(plant.k for plant in self._plants))
 
 
 def _connected(scenario: Scenario, recorded: bool) -> Scenario:
@@ -285,9 +351,10 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
         nodes: dict[str, _Process] = {}
         try:
             if bag is not None:
-                nodes["recorder"] = _Process("recorder", params, as_dict(_recording(scenario, bag, params)))
+                recording = as_dict(_recording(scenario, bag, params))
+                nodes["recorder"] = _Process("recorder", _node_command("recorder", params, recording))
             for name in reversed(SCHEMAS):
-                nodes[name] = _Process(name, connected_params, {}, connected.domain_of(name))
+                nodes[name] = _Process(name, _node_command(name, connected_params, {}), connected.domain_of(name))
             outcome = _watch(nodes, stop, progress)
             return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
         finally:
@@ -321,17 +388,70 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     return Outcome(plant.steps, plant.pace.rate, failure, "" if failed else recording, recording if failed else "")
 
 
-class _Process:
-    """One node in a process of its own, with what it says."""
+def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress) -> list[Outcome]:
+    """As `run_fleet`, with one process for each vehicle: its nodes have one, as they cost most where they are apart."""
+    for scenario in fleet.values():  # what cannot be used is to be said once
+        _connected(scenario, recorded=bag is not None)
+    with stop_on_signals() as stop, ExitStack() as files:
+        vehicles: list[_Process] = []
+        try:
+            for name, scenario in fleet.items():
+                params = files.enter_context(_params_file(scenario))
+                command = [sys.executable, "-m", "agv_analysis.runner", name, str(params), str(bag or "")]
+                vehicles.append(_Process(name, command))
+            for vehicle in vehicles:
+                while vehicle.is_running(_LOOK_PERIOD) and not stop.requested:
+                    progress(sum(other.steps for other in vehicles))
+        finally:
+            for vehicle in vehicles:
+                vehicle.tell(signal.SIGINT)
+            for vehicle in vehicles:
+                vehicle.collect()
+        outcomes = [_outcome_of(vehicle, stop.requested) for vehicle in vehicles]
+        progress(sum(outcome.steps for outcome in outcomes))
+        return outcomes
 
-    def __init__(self, name: str, params: Path, settings: dict[str, Any], domain_id: int = -1) -> None:
+
+def _outcome_of(vehicle: _Process, stopped: bool) -> Outcome:
+    """What a vehicle's process says in its last line, unless something ended it before."""
+    try:
+        return Outcome(**json.loads(vehicle.last_words()))
+    except (ValueError, TypeError):
+        failure = f"interrupted after step {vehicle.steps}" if stopped else vehicle.last_words()
+        return Outcome(vehicle.steps, vehicle.pace.rate, failure, "", "")
+
+
+def _drive_vehicle(name: str, params: str, bag: str) -> None:
+    """Body of a vehicle's process: its progress goes to standard output and, as the last line, its Outcome."""
+    scenario = load_scenario(params)
+    steps, said = scenario.plant.duration / scenario.plant.ts, time.monotonic()
+
+    def say(k: int) -> None:
+        nonlocal said
+        if time.monotonic() - said > _SAY_PERIOD:
+            said = time.monotonic()
+            click.echo(progress_line(k, steps))
+
+    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, say)
+    click.echo(json.dumps(dataclasses.asdict(outcome)))
+
+
+def _node_command(name: str, params: Path, settings: dict[str, Any]) -> list[str]:
+    """Command that starts a node."""
+    command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
+    for parameter, value in settings.items():
+        command += ["-p", f"{parameter}:={json.dumps(value)}"]
+    return command
+
+
+class _Process:
+    """One node, or one vehicle, in a process of its own, with what it says."""
+
+    def __init__(self, name: str, command: Sequence[str], domain_id: int = -1) -> None:
         self.name = name
         self.steps = 0
         self.pace = _Pace()
         self._lines: list[str] = []
-        command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
-        for parameter, value in settings.items():
-            command += ["-p", f"{parameter}:={json.dumps(value)}"]
         domain = {"ROS_DOMAIN_ID": str(domain_id)} if domain_id >= 0 else {}
         # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order.
         self._process = subprocess.Popen(
@@ -385,3 +505,10 @@ class _Process:
             self._process.kill()
         self._process.wait()
         self._reader.join()
+
+
+if __name__ == "__main__":
+    try:
+        _drive_vehicle(*sys.argv[1:])
+    except UserError as error:
+        raise SystemExit(str(error)) from None

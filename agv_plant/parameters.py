@@ -144,7 +144,9 @@ class ChannelParameters:
         high=300.0, runtime=True,
     )  # fmt: skip
     vehicles: int = parameter(1, "shared: number of AGVs that share the link", low=1, high=1000)
-    vehicle: int = parameter(0, "shared: which of them this one is, from 0 on", low=0, high=999)
+    vehicle: int = parameter(
+        0, "which AGV of a fleet this one is, from 0 on; each has random numbers of its own", low=0, high=999
+    )
     blocks: int = parameter(1, "shared: how many of them may send in a slot", low=1, high=1000)
     scheduler: str = parameter(
         SCHEDULERS[0],

@@ -28,22 +28,27 @@ from agv_ros.wire import DELAYED, DELIVERED, LOST, Slot
 _BLOCK = 4096
 
 
+def own_stream(parameters: ChannelParameters, stream: str) -> str:
+    """Name of a vehicle's random numbers on a link; those of the first have the link's own name."""
+    return stream_of(stream, parameters.vehicle) if parameters.vehicle else stream
+
+
 def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
     """Random numbers of a channel's slots first .. first + count - 1, uniform in [0, 1), shape (count, DRAWS).
 
     In a share `correlation` of the slots they are those of the uplink. Of two equal channels without memory the losses
     then have exactly this correlation coefficient.
     """
-    own = uniforms(seed, stream, first, count)
+    own = uniforms(seed, own_stream(parameters, stream), first, count)
     if parameters.correlation == 0.0:
         return own
     shared = uniforms(seed, f"{stream}/correlation", first, count)[:, :1] < parameters.correlation
     return np.where(shared, uniforms(seed, UPLINK, first, count), own)
 
 
-def delay_draws(seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
+def delay_draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
     """The same for delays, those of a link alone."""
-    return uniforms(seed, f"{stream}/delay", first, count)
+    return uniforms(seed, f"{own_stream(parameters, stream)}/delay", first, count)
 
 
 class Verdict(NamedTuple):
@@ -105,7 +110,7 @@ class Channel:
         self._trace = load_trace(parameters.trace_file) if measured else ()
         self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
         self._random = _in_blocks(lambda first, count: draws(self.parameters, seed, stream, first, count))
-        self._random_delays = _in_blocks(lambda first, count: delay_draws(seed, stream, first, count))
+        self._random_delays = _in_blocks(lambda first, count: delay_draws(self.parameters, seed, stream, first, count))
         self._next = 0
         self._state = GOOD
         self._last = Verdict(False)

@@ -94,6 +94,7 @@ class LoopNode(Node, Generic[P]):
         self._ended = False
         self._changes: dict[str, str] = {}
         self._uses_arguments = node_options.get("use_global_arguments", True)
+        self._own_arguments = node_options.get("cli_args")
         self.sides: list[Node] = []
         """What this node is in other DDS domains; to be spun with it."""
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
@@ -112,7 +113,7 @@ class LoopNode(Node, Generic[P]):
         self.sides.append(
             Node(
                 self.get_name(), context=context, namespace=self.get_namespace(), start_parameter_services=False,
-                enable_rosout=False, use_global_arguments=self._uses_arguments,
+                enable_rosout=False, use_global_arguments=self._uses_arguments, cli_args=self._own_arguments,
             )
         )  # fmt: skip
         return self.sides[-1]

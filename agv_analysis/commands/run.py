@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from agv_analysis.commands import needs_ros, with_settings
+
+if TYPE_CHECKING:
+    from agv_analysis.fleet import Vehicle
+    from agv_analysis.runner import Outcome
+    from agv_analysis.scenario import Scenario
+
+PITCH = 20.0
+"""Distance [m] of the tracks of two neighbours in a fleet: the paper's track is 18.07 m wide."""
 
 
 @click.command("run")
 @with_settings
 @click.option("--bag", type=click.Path(path_type=Path), help="Record to this directory, which must not exist.")
 @click.option("--clock", type=click.Choice(["lockstep", "realtime"]), help="As --set plant.clock=...")
-@click.option("--processes", is_flag=True, help="One process for each node instead of one for all.")
+@click.option("--processes", is_flag=True, help="One process for each node, of a fleet for each vehicle.")
 @click.option("--duration", type=float, help="As --set plant.duration=... [s]; cuts the run short.")
 @click.option("--seed", type=int, help="As --set relay.seed=... --set plant.seed=...")
+@click.option(
+    "--fleet",
+    type=click.IntRange(1, 1000),
+    metavar="N",
+    help="N loops, in the namespaces agv_01, agv_02, ..., that share one uplink; each records to BAG/agv_01, ...",
+)
+@click.option("--pitch", type=float, default=PITCH, show_default=True, help="Fleet: tracks lie so far apart [m].")
 def command(
     params: str,
     settings: tuple[str, ...],
@@ -24,20 +40,29 @@ def command(
     processes: bool,
     duration: float | None,
     seed: int | None,
+    fleet: int | None,
+    pitch: float,
 ) -> None:
-    """Run the loop of the params file PARAMS on DDS.
+    """Run the loop of the params file PARAMS on DDS, or a fleet of such loops.
+
+    The uplink of a fleet is relay.uplink.model=shared with as many vehicles, and with blocks, scheduler and p of the
+    file; perfect becomes shared with p=0, bernoulli shared with its p, and other models are refused.
 
     \b
     Examples:
       agv-ncs run config/paper.yaml
       agv-ncs run config/outages.yaml --bag bags/first --seed 7
       agv-ncs run config/paper.yaml --clock realtime --processes --duration 10
+      agv-ncs run config/paper.yaml --set relay.uplink.blocks=2 --fleet 8 --bag bags/fleet
     """
     from agv_analysis.scenario import load_scenario
 
     shorthands = {"plant.clock": clock, "plant.duration": duration, "relay.seed": seed, "plant.seed": seed}
     given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
     scenario = load_scenario(params, (*settings, *given))
+    if fleet is not None:
+        _run_fleet(scenario, fleet, pitch, bag, processes)
+        return
     with needs_ros():
         from agv_analysis import runner
     from agv_analysis.progress import step_bar
@@ -53,3 +78,77 @@ def command(
     failures = [failure for failure in (outcome.failure, outcome.recording_failure) if failure]
     if failures:
         raise click.ClickException("; ".join(failures))
+
+
+def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, processes: bool) -> None:
+    from agv_analysis.fleet import new_directory, vehicle_names, vehicle_scenarios, write_fleet
+    from agv_analysis.progress import step_bar
+
+    fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
+    with needs_ros():
+        from agv_analysis import runner
+    if bag is not None:
+        new_directory(bag)
+    with step_bar(count * scenario.plant.duration / scenario.plant.ts) as progress:
+        outcomes = (runner.run_fleet_in_processes if processes else runner.run_fleet)(fleet, bag, progress)
+    ended = dict(zip(fleet, outcomes, strict=True))
+    rate = sum(outcome.rate for outcome in outcomes)
+    click.echo(
+        f"{count} AGVs, {sum(outcome.steps for outcome in outcomes)} steps" + (f", {rate:.0f} steps/s" * bool(rate))
+    )
+    vehicles = _judged(ended, bag)
+    if bag is not None:
+        _print_fleet(vehicles)
+        for path in write_fleet(vehicles, bag):
+            click.echo(f"{path.suffix[1:] + ':':<8} {path}")
+    failures = [f"{vehicle.vehicle}: {vehicle.failure}" for vehicle in vehicles if vehicle.failure]
+    if failures:
+        raise click.ClickException("\n".join(failures))
+
+
+def _judged(ended: dict[str, Outcome], bag: Path | None) -> list[Vehicle]:
+    """Each vehicle by its recording, if there is one."""
+    from agv_analysis.fleet import Vehicle, judge
+    from agv_analysis.progress import step_bar
+
+    vehicles = []
+    with step_bar(len(ended), "judging") as progress:
+        for name, outcome in ended.items():
+            failure = "; ".join(filter(None, (outcome.failure, outcome.recording_failure)))
+            vehicles.append(
+                Vehicle(name, outcome.steps, failure)
+                if bag is None
+                else judge(name, outcome.steps, failure, bag / name)
+            )
+            progress(len(vehicles))
+    return vehicles
+
+
+def _print_fleet(vehicles: list[Vehicle]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from agv_analysis.fleet import instability
+
+    table = Table(box=None, pad_edge=False)
+    table.add_column("AGV", no_wrap=True)
+    for heading in ("steps", "lost", "outage", "to 1 cm", "error [m]", "twins"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict")
+    for one in vehicles:
+        table.add_row(
+            one.vehicle, str(one.steps), _text(one.loss_rate, ".2%"), _text(one.longest_outage, "d"),
+            _text(one.settle_1cm_steps, "d"), _text(one.final_error, ".3g"), _text(one.contraction, ".2g"),
+            one.verdict or "-",
+        )  # fmt: skip
+    console, found = Console(highlight=False), instability(vehicles)
+    console.print(table)
+    if found.judged:
+        console.print(
+            f"Unstable: {found.unstable} of {found.judged} AGVs, {found.fraction:.1%} "
+            f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
+        )
+
+
+def _text(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"

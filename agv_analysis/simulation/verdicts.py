@@ -27,7 +27,7 @@ from agv_plant.channels.placed import floor_of, kind_of, levels_of
 from agv_plant.channels.schedule import Segment, is_scripted, segments_of
 from agv_plant.channels.shared import SCHEDULERS, serve_all, stream_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, delay_draws, draws, losses
+from agv_plant.radio import Channel, delay_draws, draws, losses, own_stream
 from agv_plant.random_stream import uniforms
 from agv_ros.parameters import LoopParameters
 
@@ -45,7 +45,7 @@ class Air:
         self._steps = steps
         self._seed = seed
         self._ts = ts
-        self._shared = functools.cache(lambda stream: draws(ChannelParameters(), seed, stream, 0, steps))
+        self._shared = functools.cache(lambda stream: uniforms(seed, stream, 0, steps))
         self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
         self._ways = functools.lru_cache(maxsize=8)(self._way)
         self.normals = functools.cache(lambda stream: normals(seed, stream, steps))
@@ -116,7 +116,7 @@ class Air:
 
     def _draws(self, channel: ChannelParameters, stream: str) -> NDArray[np.float64]:
         if channel.correlation == 0.0:
-            return self._shared(stream)
+            return self._shared(own_stream(channel, stream))
         return draws(channel, self._seed, stream, 0, self._steps)
 
 
@@ -138,7 +138,8 @@ def way_of(
 
 def _slots_under_way(segment: Segment, end: int, seed: int, stream: str, ts: float) -> NDArray[np.int64]:
     """Slots until the messages of a segment's slots arrive, or the first of their copies, NEVER if none does."""
-    random, now = delay_draws(seed, stream, segment.first, end - segment.first), segment.channel
+    now = segment.channel
+    random = delay_draws(now, seed, stream, segment.first, end - segment.first)
     found: NDArray[np.int64] = compiled(_waits)(
         numbers(random), segment.first, now.delay, now.jitter, now.duplicate, now.lifetime, ts
     )
