@@ -139,6 +139,10 @@ class RecorderNode(LoopNode[RecorderParameters]):
         """Is everything here that was published? Only nodes that have ended have said all that they published."""
         return not self._running and not self.missing()
 
+    def has_all_of(self, nodes: int) -> bool:
+        """Is everything here, after so many nodes said that they ended? What is on its way cannot be missed yet."""
+        return len(self._published) >= nodes and self.is_settled()
+
     def close(self) -> None:
         """Finish the bag and say what is in it."""
         missing = self.missing()

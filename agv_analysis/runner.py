@@ -250,9 +250,9 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
             for node in loop.nodes:
                 node.close()
                 node.flush(_PATIENCE)
-        recorders = [loop.recorder for loop in loops if loop.recorder]
-        spin_for(executor, lambda: all(recorder.is_settled() for recorder in recorders), _PATIENCE)
-        for recorder in recorders:
+        recorders = [(loop.recorder, len(loop.nodes)) for loop in loops if loop.recorder]
+        spin_for(executor, lambda: all(recorder.has_all_of(nodes) for recorder, nodes in recorders), _PATIENCE)
+        for recorder, _ in recorders:
             recorder.close()
         executor.shutdown()
     return [loop.outcome(pace.rate, stop.requested) for loop, pace in zip(loops, watch.paces, strict=True)]
