@@ -108,7 +108,7 @@ def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, exe
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
     with stop_on_signals() as stop, OneProcess() as process:
-        loop = _loop_in(process, scenario, bag)
+        loop = loop_of(process, scenario, bag)
         return run_loops(EXECUTORS[executor](context=process.context), [loop], stop, progress)[0]
 
 
@@ -119,12 +119,12 @@ def run_fleet(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progres
     """
     with stop_on_signals() as stop, OneProcess() as process:
         loops = [
-            _loop_in(process, scenario, None if bag is None else bag / name, name) for name, scenario in fleet.items()
+            loop_of(process, scenario, None if bag is None else bag / name, name) for name, scenario in fleet.items()
         ]
         return run_loops(EXECUTORS["events"](context=process.context), loops, stop, progress)
 
 
-def _loop_in(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: str = "") -> Loop:
+def loop_of(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: str = "") -> Loop:
     """The nodes of a scenario, in a namespace if they are a vehicle of a fleet."""
     connected = _connected(scenario, recorded=bag is not None)
     if vehicle:  # what nodes have to say beside warnings is in the fleet's table
