@@ -57,11 +57,11 @@ def _is_carried(cores: int, processes: int, count: int) -> bool:
     """Run a fleet on so many cores, divided among so many processes."""
     per_process = count // processes
     allowed = sorted(os.sched_getaffinity(0))[:cores]
-    parts = []
+    parts: list[subprocess.Popen[str]] = []
     for first in range(0, count, per_process):
         command = [sys.executable, "-m", "benchmarks.fleet", *map(str, (count, first, per_process, *allowed))]
         parts.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
-    too_late = threading.Timer(PATIENCE, lambda: [part.kill() for part in parts])
+    too_late = threading.Timer(PATIENCE, _kill, (parts,))
     too_late.start()
     are_ready = [part.stdout is not None and part.stdout.readline() == READY for part in parts]
     for part in parts:
@@ -71,6 +71,11 @@ def _is_carried(cores: int, processes: int, count: int) -> bool:
     answers = [part.communicate()[0] for part in parts]
     too_late.cancel()
     return all(answers) and sum(map(int, answers)) < MISSED * WINDOW * count
+
+
+def _kill(parts: list[subprocess.Popen[str]]) -> None:
+    for part in parts:
+        part.kill()
 
 
 def run(count: int, first: int, number: int) -> int:
