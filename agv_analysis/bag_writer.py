@@ -28,6 +28,10 @@ _WINDOW = 1024
 _BATCH = 256
 """Messages that are written at a time: few, since a loop in real time in the same process waits meanwhile."""
 
+_BY_STAMP = 64
+"""So many times as many where log times are stamps: it may be seconds before DDS brings a message again that a busy
+recorder has missed, in which a loop in lockstep goes on for thousands of steps; and there is no hurry in it."""
+
 _CHUNK = 256 * 1024
 """Size of a chunk [B], likewise."""
 
@@ -45,13 +49,17 @@ class TopicInfo(NamedTuple):
 
 
 class BagWriter:
-    """An open bag. `describe` is asked for a topic, by its number, when the first messages are written.
+    """An open bag. `describe` is asked for a topic, by its number, once there are some messages, or at the end.
 
     A topic that nobody offers is in the bag only once it has a message.
     """
 
-    def __init__(self, directory: Path, describe: Sequence[Callable[[], TopicInfo]], about: dict[str, str]) -> None:
-        """Create the directory. Raises UserError if it exists or cannot be made."""
+    def __init__(
+        self, directory: Path, describe: Sequence[Callable[[], TopicInfo]], about: dict[str, str], by_stamp: bool
+    ) -> None:
+        """Create the directory. `by_stamp`: log times are stamps. Raises UserError if it exists or cannot be made."""
+        self._window, self._batch = (_BY_STAMP * _WINDOW, _BY_STAMP * _BATCH) if by_stamp else (_WINDOW, _BATCH)
+        self._room = _WINDOW  # until topics are described, while those who offer them are still there
         self._directory = directory
         self._file_name = f"{directory.name}_0.mcap"
         self._describe = describe
@@ -78,8 +86,9 @@ class BagWriter:
         """Add a message to the topic with this number."""
         self._pending.append((log_time_ns, topic, data, publish_time_ns))
         self.counts[topic] += 1
-        if len(self._pending) >= _WINDOW + _BATCH:
-            self._write_all_but(_WINDOW)
+        if len(self._pending) >= self._room:
+            self._write_all_but(self._window)
+            self._room = self._window + self._batch
 
     def close(self) -> None:
         """Write what is held back, the index and metadata.yaml."""
@@ -98,16 +107,17 @@ class BagWriter:
                 topic = describe()
                 if topic.offered_qos or self.counts[number]:
                     self._register(number, topic)
-        self._pending.sort()
         count = len(self._pending) - newest
+        if count <= 0:
+            return
+        self._pending.sort()
         for log_time_ns, number, data, publish_time_ns in self._pending[:count]:
             if number not in self._channels:
                 self._register(number, self._describe[number]())
             self._writer.add_message(self._channels[number], log_time_ns, data, publish_time_ns)
-        if count > 0:
-            self._first_ns = self._first_ns or self._pending[0][0]
-            self._last_ns = max(self._last_ns, self._pending[count - 1][0])
-            del self._pending[:count]
+        self._first_ns = self._first_ns or self._pending[0][0]
+        self._last_ns = max(self._last_ns, self._pending[count - 1][0])
+        del self._pending[:count]
 
     def _register(self, number: int, topic: TopicInfo) -> None:
         self._topics[number] = topic

@@ -72,7 +72,7 @@ class RecorderNode(LoopNode[RecorderParameters]):
             self._describer(topic, kind, where)
             for topic, kind, where in zip(self._names, TOPICS.values(), sides, strict=True)
         ]
-        self._writer = BagWriter(Path(settings.bag), describe, self.about())
+        self._writer = BagWriter(Path(settings.bag), describe, self.about(), by_stamp=settings.log_time == "stamp")
         self._now_ns: Callable[[int], int] = (
             (lambda stamp_ns: stamp_ns) if settings.log_time == "stamp" else (lambda _: time.time_ns())
         )
