@@ -22,6 +22,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
+from agv_analysis.bag_writer import BagWriter, TopicInfo
 from agv_analysis.message_schema import schema_of
 from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.recording import read_run
@@ -213,3 +214,16 @@ def test_a_bag_that_exists_is_not_touched(agv_ncs: AgvNcs, tmp_path: Path, optio
 def test_a_type_that_is_not_installed_is_named() -> None:
     with pytest.raises(UserError, match="no_such_msgs/Thing"):
         schema_of("no_such_msgs/msg/Thing")
+
+
+def test_a_message_that_comes_late_is_put_in_its_place(tmp_path: Path) -> None:
+    """DDS may take seconds to bring one again; a loop in lockstep has gone on for thousands of steps by then."""
+    topic = TopicInfo("/topic", "geometry_msgs/msg/PoseStamped", schema_of("geometry_msgs/msg/PoseStamped"), "", [])
+    writer = BagWriter(tmp_path / "bag", [lambda: topic], {}, by_stamp=True)
+    sent = [*range(90_000), 50_000, *range(90_000, 100_000)]
+    for ns in sent:
+        writer.write(0, b"\0", ns, ns)
+    writer.close()
+    with next((tmp_path / "bag").glob("*.mcap")).open("rb") as file:
+        times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+    assert [pair for pair in zip(times, sorted(sent), strict=True) if pair[0] != pair[1]] == []
