@@ -7,7 +7,8 @@ files, whatever way the messages of a step overtook each other on their way to t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,6 +49,18 @@ class TopicInfo(NamedTuple):
     offered_qos: Sequence[dict[str, Any]]
 
 
+@contextmanager
+def new_directory(directory: Path) -> Iterator[None]:
+    """Make a directory for recordings, and what is in it first. Raises UserError if it exists or cannot be made."""
+    try:
+        directory.mkdir(parents=True)
+        yield
+    except FileExistsError:
+        raise UserError(f"{directory}: exists already; name a new directory or remove it first") from None
+    except OSError as error:
+        raise UserError(f"{directory}: cannot be recorded to: {error.strerror}") from None
+
+
 class BagWriter:
     """An open bag. `describe` is asked for a topic, by its number, once there are some messages, or at the end.
 
@@ -69,13 +82,8 @@ class BagWriter:
         self._pending: list[tuple[int, int, bytes, int]] = []
         self.counts = [0] * len(describe)
         self._first_ns, self._last_ns = 0, 0
-        try:
-            directory.mkdir(parents=True)
+        with new_directory(directory):
             self._file = (directory / self._file_name).open("xb")
-        except FileExistsError:
-            raise UserError(f"{directory}: exists already; name a new directory or remove it first") from None
-        except OSError as error:
-            raise UserError(f"{directory}: cannot be recorded to: {error.strerror}") from None
         self._writer = Writer(
             self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True
         )

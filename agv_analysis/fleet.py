@@ -7,11 +7,11 @@ the first vehicle's.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.stability.empirical import distances
-from agv_analysis.sweep.summary import write_rows
 from agv_plant.channels.installed import SHARED
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
@@ -190,24 +189,8 @@ def instability(fleet: Sequence[Vehicle]) -> Instability:
     return Instability(hits, len(judged), *(clopper_pearson(hits, len(judged)) if judged else (0.0, 1.0)))
 
 
-def new_directory(path: Path) -> None:
-    """Make a directory for a fleet's recordings. Raises UserError if it exists or cannot be made."""
-    try:
-        path.mkdir(parents=True)
-    except FileExistsError:
-        raise UserError(f"{path}: exists already; name a new directory or remove it first") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be recorded to: {error.strerror}") from None
-
-
-def write_fleet(fleet: Sequence[Vehicle], directory: Path) -> list[Path]:
-    """Write fleet.json and fleet.csv; returns their paths. Raises UserError if they cannot be written."""
-    rows, found = [asdict(vehicle) for vehicle in fleet], instability(fleet)
-    content = {"vehicles": rows, **asdict(found), "fraction": found.fraction if found.judged else None}
-    as_json, as_csv = directory / "fleet.json", directory / "fleet.csv"
-    try:
-        as_json.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{as_json}: cannot be written: {error.strerror}") from None
-    write_rows(rows, as_csv)
-    return [as_json, as_csv]
+def to_json(fleet: Sequence[Vehicle]) -> dict[str, Any]:
+    """All vehicles, and how many of them were unstable, as plain values."""
+    found = instability(fleet)
+    share = found.fraction if found.judged else None
+    return {"vehicles": [asdict(vehicle) for vehicle in fleet], **asdict(found), "fraction": share}

@@ -144,7 +144,6 @@ class _Reading:
             table.append(batch)
         except UndecodableError as error:
             self._refuse(channel.topic, error)
-            self._latest.clear()
 
     def finish(self, storage: Storage) -> None:
         """Take over what is known of a file after its last message."""
@@ -182,6 +181,7 @@ class _Reading:
     def _refuse(self, topic: str, error: UndecodableError) -> None:
         self._refusals[topic] = f"cannot be decoded: {error}"
         self._tables.pop(topic, None)
+        self._latest.clear()
 
     def bag(self, path: Path, contents: Contents) -> Bag:
         """The bag, once all files have been read."""

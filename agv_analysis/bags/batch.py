@@ -128,6 +128,14 @@ def gather(buffer: Bytes, starts: Ints, size: int) -> Bytes:
     return np.asarray(numbers_at(buffer, starts, f"V{size}").view(np.uint8).reshape(-1, size))
 
 
+def number(buffer: Bytes, place: int, size: int) -> int:
+    """The little-endian number of so many bytes at a place; a single load, once compiled."""
+    value = np.int64(0)
+    for i in range(size):
+        value |= np.int64(buffer[place + i]) << (8 * i)
+    return int(value)
+
+
 def numbers_at(buffer: Bytes, starts: Ints, code: str) -> NDArray[Any]:
     """The values of numpy type `code` that begin at each of `starts`, aligned or not, shape (n,)."""
     windows: NDArray[Any] = np.ndarray((len(buffer) - np.dtype(code).itemsize + 1,), code, buffer, strides=(1,))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.batch import Bytes, Ints
+from agv_analysis.bags.batch import Bytes, Ints, number
 from agv_analysis.bags.checks import is_fraction
 from agv_analysis.bags.layout import LEAD, Layout
 from agv_analysis.compiled import HAS_NUMBA, compiled
@@ -135,14 +135,6 @@ def place(
         if not is_orderly:
             clock[1] += 1
     return len(starts)
-
-
-def number(buffer: Bytes, place: int, size: int) -> int:
-    """The little-endian number of so many bytes at a place; a single load, once compiled."""
-    value = np.int64(0)
-    for i in range(size):
-        value |= np.int64(buffer[place + i]) << (8 * i)
-    return int(value)
 
 
 def compiled_place() -> Callable[..., Any] | None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.bags.batch import Bytes, Ints
+from agv_analysis.bags.batch import Bytes, Ints, number
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD
 from agv_analysis.compiled import HAS_NUMBA, compiled
 
@@ -67,16 +67,10 @@ def message_length(content: Bytes, position: int) -> int:
     left = len(content) - position - _RECORD
     if left < MESSAGE_HEAD or content[position] != MESSAGE:
         return -1
-    length = np.int64(0)
-    for i in range(4):
-        length |= np.int64(content[position + 1 + i]) << (8 * i)
-        if content[position + 5 + i] != 0:
-            return -1
-    if length < MESSAGE_HEAD or length > left:
-        return -1
-    return int(length)
+    length = number(content, position + 1, 8)
+    return -1 if length < MESSAGE_HEAD or length > left else length
 
 
 def channel_of(content: Bytes, position: int) -> int:
     """Channel of the message record at `position`."""
-    return int(np.int64(content[position + _RECORD]) | np.int64(content[position + _RECORD + 1]) << 8)
+    return number(content, position + _RECORD, 2)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from agv_analysis.commands import needs_ros, with_settings
+from agv_analysis.commands import needs_ros, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.fleet import Vehicle
@@ -81,14 +81,17 @@ def command(
 
 
 def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, processes: bool) -> None:
-    from agv_analysis.fleet import new_directory, vehicle_names, vehicle_scenarios, write_fleet
+    from agv_analysis.bag_writer import new_directory
+    from agv_analysis.fleet import to_json, vehicle_names, vehicle_scenarios
     from agv_analysis.progress import step_bar
+    from agv_analysis.sweep.summary import write_rows
 
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
     with needs_ros():
         from agv_analysis import runner
     if bag is not None:
-        new_directory(bag)
+        with new_directory(bag):
+            pass  # each vehicle's recorder goes on in it
     with step_bar(count * scenario.plant.duration / scenario.plant.ts) as progress:
         outcomes = (runner.run_fleet_in_processes if processes else runner.run_fleet)(fleet, bag, progress)
     ended = dict(zip(fleet, outcomes, strict=True))
@@ -99,8 +102,10 @@ def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, p
     vehicles = _judged(ended, bag)
     if bag is not None:
         _print_fleet(vehicles)
-        for path in write_fleet(vehicles, bag):
-            click.echo(f"{path.suffix[1:] + ':':<8} {path}")
+        content, as_json, as_csv = to_json(vehicles), bag / "fleet.json", bag / "fleet.csv"
+        write_json(as_json, content)
+        write_rows(content["vehicles"], as_csv)
+        click.echo(f"json:    {as_json}\ncsv:     {as_csv}")
     failures = [f"{vehicle.vehicle}: {vehicle.failure}" for vehicle in vehicles if vehicle.failure]
     if failures:
         raise click.ClickException("\n".join(failures))

@@ -115,10 +115,10 @@ def _text(key: str, value: Any) -> str:
     if key in CHOICES:
         return str(value)
     if key in ("n", "seed"):
-        return str(round(value))
+        return _literal(round(value))
     if key == "v_max" and value >= NO_LIMIT:
-        return ".inf"
-    return repr(float(value) / 1e3 if key in ("ts", "delay") else float(value))
+        return _literal(math.inf)
+    return _literal(float(value) / 1e3 if key in ("ts", "delay") else float(value))
 
 
 def _initial_pose(base: Scenario, ahead: float, left: float) -> tuple[float, float, float]:
