@@ -11,11 +11,13 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 import yaml
+from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag, read_bag
 
 REPOSITORY = Path(__file__).parents[1]
 CONFIG = REPOSITORY / "config"
+PLOTJUGGLER = ET.parse(CONFIG / "plotjuggler.xml").getroot()
 
 LATCHED = {"/edge/reference": "nav_msgs/msg/Path"}
 """Topics of a running loop that a recording does not hold."""
@@ -35,10 +37,17 @@ def exists(bag: Bag, name: str, separator: str) -> bool:
 
 
 def of_plotjuggler() -> list[str]:
-    root = ET.parse(CONFIG / "plotjuggler.xml").getroot()
-    curves = [curve.attrib for curve in root.iter("curve")]
+    curves = [curve.attrib for curve in PLOTJUGGLER.iter("curve")]
     keys = (("curve_x", "curve_y") if "curve_x" in curve else ("name",) for curve in curves)
     return [curve[key] for curve, of_curve in zip(curves, keys, strict=True) for key in of_curve]
+
+
+def series(bag: Bag, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What PlotJuggler draws under this name: seconds since the first message, and values."""
+    topic = next(topic for topic in bag.topics if name.startswith(topic + "/"))
+    first = min(int(bag[topic]["log_time_ns"][0]) for topic in bag.topics)
+    values = bag[topic][name.removeprefix(topic + "/").replace("/", ".")]
+    return (bag[topic]["log_time_ns"] - first) * 1e-9, values.astype(np.float64)
 
 
 def strings(tree: object) -> Iterator[str]:
@@ -72,22 +81,61 @@ def test_plotjuggler_finds_every_curve(sample: Bag) -> None:
 
 def test_plotjuggler_s_plots_are_not_empty(sample: Bag) -> None:
     for name in of_plotjuggler():
-        topic = next(topic for topic in sample.topics if name.startswith(topic + "/"))
-        column = sample[topic][name.removeprefix(topic + "/").replace("/", ".")]
-        assert np.ptp(column) > 0.0, name
+        _, values = series(sample, name)
+        assert np.ptp(values) > 0.0, name
+
+
+def test_plotjuggler_s_limits_leave_out_the_start_alone(sample: Bag) -> None:
+    # metres from its reference, the AGV is told to drive at more than 100 m/s: beside that nothing else would be seen
+    limited = [plot for plot in PLOTJUGGLER.iter("plot") if plot.find("limitY[@min]") is not None]
+    assert len(limited) == 2
+    for plot in limited:
+        limits = plot.find("limitY")
+        assert limits is not None
+        low, high = float(limits.get("min", "nan")), float(limits.get("max", "nan"))
+        outside: list[float] = []
+        for curve in plot.iter("curve"):
+            times, values = series(sample, curve.attrib["name"])
+            outside += times[(values < low) | (values > high)].tolist()
+        assert outside
+        assert max(outside) < 1.0
+
+
+def test_plotjuggler_draws_commands_as_held() -> None:
+    # "Step (post)" in its menu; "Steps" is "Steps (pre)", which draws a command before it was given
+    plots = [
+        plot for plot in PLOTJUGGLER.iter("plot") if any("/cmd_vel/" in c.attrib["name"] for c in plot.iter("curve"))
+    ]
+    assert [plot.get("style") for plot in plots] == ["StepsInv", "StepsInv"]
+
+
+def test_plotjuggler_s_track_shows_which_poses_were_lost() -> None:
+    # dots, for a line would bridge an outage; those that arrived over those that were sent
+    (track,) = PLOTJUGGLER.iterfind(".//plot[@mode='XYPlot']")
+    assert track.get("style") == "Dots"
+    assert [curve.attrib["curve_x"].split("/pose")[0] for curve in track.iter("curve")] == ["/agv", "/edge"]
+
+
+def test_plotjuggler_counts_time_from_the_start(sample: Bag) -> None:
+    offset = PLOTJUGGLER.find("use_relative_time_offset")
+    assert offset is not None
+    assert offset.get("enabled") == "1"
+    # either choice of its dialog, publish time or log time, is the loop's time
+    for topic in sample.topics:
+        assert np.array_equal(sample[topic]["publish_time_ns"], sample[topic]["log_time_ns"]), topic
 
 
 def test_plotjuggler_s_layout_has_the_form_that_it_reads() -> None:
     # as its own reader goes through it: PlotDocker::restoreSplitter and PlotWidget::xmlLoadState
-    root = ET.parse(CONFIG / "plotjuggler.xml").getroot()
-    assert [tab.tag for tab in root.find("tabbed_widget") or ()] == ["Tab", "Tab"]
-    for splitter in root.iter("DockSplitter"):
+    assert [tab.tag for tab in PLOTJUGGLER.find("tabbed_widget") or ()] == ["Tab", "Tab"]
+    for splitter in PLOTJUGGLER.iter("DockSplitter"):
         assert splitter.get("orientation") in ("|", "-")
         sizes = [float(size) for size in splitter.get("sizes", "").split(";")]
         assert len(splitter) == int(splitter.get("count", "0")) == len(sizes)
         assert sum(sizes) == pytest.approx(1.0, abs=1e-5)
-    for plot in root.iter("plot"):
+    for plot in PLOTJUGGLER.iter("plot"):
         assert plot.get("mode") in ("TimeSeries", "XYPlot")
+        assert plot.get("style") in ("Lines", "Dots", "LinesAndDots", "Sticks", "Steps", "StepsInv")
         for curve in plot.iter("curve"):
             wanted = {"name", "color"} | ({"curve_x", "curve_y"} if plot.get("mode") == "XYPlot" else set())
             assert set(curve.attrib) == wanted
