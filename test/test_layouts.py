@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -17,6 +18,7 @@ from agv_analysis.bags import Bag, read_bag
 
 REPOSITORY = Path(__file__).parents[1]
 CONFIG = REPOSITORY / "config"
+FOXGLOVE: dict[str, Any] = json.loads((CONFIG / "foxglove.json").read_text())
 PLOTJUGGLER = ET.parse(CONFIG / "plotjuggler.xml").getroot()
 
 LATCHED = {"/edge/reference": "nav_msgs/msg/Path"}
@@ -62,8 +64,27 @@ def strings(tree: object) -> Iterator[str]:
 
 
 def of_foxglove() -> list[str]:
-    panels = json.loads((CONFIG / "foxglove.json").read_text())["configById"]
-    return sorted({text for text in strings(panels) if text.startswith("/")})
+    return sorted({recorded(text) for text in strings(FOXGLOVE["configById"]) if text.startswith("/")})
+
+
+def recorded(path: str) -> str:
+    """The path of the recorded field behind a path of Foxglove's: a script of the layout passes some on."""
+    for script in FOXGLOVE["userNodes"].values():
+        source = script["sourceCode"]
+        (output,) = re.findall(r'^export const output = "(.+)";$', source, re.MULTILINE)
+        (topic,) = re.findall(r'^export const inputs = \["(.+)"\];$', source, re.MULTILINE)
+        for name, field in re.findall(r"(\w+): event\.message\.([\w.]+)", source):
+            if path == f"{output}.{name}":
+                return f"{topic}.{field}"
+    return path
+
+
+def topic_of(path: str) -> str:
+    return path.partition(".")[0]
+
+
+def plots_of_foxglove() -> list[dict[str, Any]]:
+    return [panel for name, panel in FOXGLOVE["configById"].items() if name.startswith("Plot!")]
 
 
 def test_the_check_sees_what_is_not_there(sample: Bag) -> None:
@@ -143,16 +164,46 @@ def test_plotjuggler_s_layout_has_the_form_that_it_reads() -> None:
 
 def test_foxglove_finds_every_path(sample: Bag) -> None:
     names = of_foxglove()
-    assert len(names) >= 9
+    assert len(names) >= 11
     plain = {name for name in names if "." not in name}
     assert plain - set(LATCHED) <= set(sample.topics)
     assert [name for name in names if "." in name and not exists(sample, name, ".")] == []
 
 
 def test_foxglove_shows_every_panel_that_it_describes() -> None:
-    layout = json.loads((CONFIG / "foxglove.json").read_text())
-    shown = {text for text in strings(layout["layout"]) if re.match(r"\w+!", text)}
-    assert shown == set(layout["configById"])
+    shown = {text for text in strings(FOXGLOVE["layout"]) if re.match(r"\w+!", text)}
+    assert shown == set(FOXGLOVE["configById"])
+
+
+def test_foxglove_s_panels_have_titles_where_both_programs_look() -> None:
+    titles = [(panel["foxglovePanelTitle"], panel["lichtblickPanelTitle"]) for panel in FOXGLOVE["configById"].values()]
+    assert all(title and title == same for title, same in titles)
+    assert len(set(titles)) == len(titles)
+
+
+def test_foxglove_s_track_pairs_x_and_y_of_the_same_pose() -> None:
+    # They are paired by their places in two rows, so both must be of one recorded topic. Yet the layout
+    # must name two topics: Lichtblick's CustomDatasetsBuilder.handleMessageRange takes a batch of messages for x
+    # or for y, not for both.
+    (track,) = (plot for plot in plots_of_foxglove() if plot["xAxisVal"] == "custom")
+    (y,), x = (path["value"] for path in track["paths"]), track["xAxisPath"]["value"]
+    assert topic_of(x) != topic_of(y)
+    assert (recorded(x), recorded(y)) == ("/agv/pose.pose.position.x", "/agv/pose.pose.position.y")
+
+
+def test_foxglove_s_axes_leave_out_the_start_only(sample: Bag) -> None:
+    limited = [plot for plot in plots_of_foxglove() if "minYValue" in plot]
+    assert len(limited) == 2
+    for plot in limited:
+        curves = [series(sample, path["value"].replace(".", "/")) for path in plot["paths"]]
+        outside = [times[(values < plot["minYValue"]) | (values > plot["maxYValue"])] for times, values in curves]
+        assert 0.0 < np.concatenate(outside).max() < 0.2, plot["foxglovePanelTitle"]
+
+
+def test_foxglove_s_scene_is_in_the_frame_of_the_poses(sample: Bag) -> None:
+    scene = FOXGLOVE["configById"]["3D!scene"]
+    for topic in set(scene["topics"]) - set(LATCHED):
+        assert set(sample[topic]["header.frame_id"]) == {scene["fixedFrame"].encode()}
 
 
 def test_rviz_shows_every_display() -> None:
