@@ -14,7 +14,7 @@ from agv_ros.parameters import as_dict, parameters_of
 from agv_ros.params_file import read_sections
 
 CONFIG = Path(__file__).parent.parent / "config"
-FILES = set(CONFIG.glob("*.yaml")) - {CONFIG / "play_qos.yaml"}  # which is for rosbag2's player
+FILES = set(CONFIG.glob("*.yaml")) - {CONFIG / "rosbag2_qos.yaml"}  # which is not for our nodes
 LOOPS = sorted(path for path in FILES if set(read_sections(str(path))) & set(SCHEMAS))
 
 

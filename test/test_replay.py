@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import itertools
 import json
 import math
+import shutil
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).parents[1]
 SAMPLE = REPOSITORY / "bags/sample"
+QOS = REPOSITORY / "config/rosbag2_qos.yaml"
 AgvNcs = Callable[..., tuple[int, str]]
 
 
@@ -330,14 +334,26 @@ def test_a_slot_is_answered_however_often_it_is_sent(first: int) -> None:
         assert answers == {first: now, first + 1: after}, places
 
 
-def test_ros2_bag_play_into_nodes_on_simulated_time(start: Start) -> None:
-    """What `ros2 bag play --clock --topics /edge/pose /edge/slot` sends, with config/play_qos.yaml."""
+class Edge(NamedTuple):
+    """The edge's two nodes on simulated time, each in a process of its own, and one that hears their commands."""
+
+    node: Any
+    spin_until: Callable[[Callable[[], bool]], None]
+    answers: list[bytes]
+
+    def await_answers(self) -> None:
+        """See that the recorded commands come back, byte for byte."""
+        wanted = read_bag(SAMPLE).payloads("/edge/cmd_vel")
+        self.spin_until(lambda: len(self.answers) >= len(wanted))
+        assert not {stamp_of(data) for data in wanted} - {stamp_of(data) for data in self.answers}
+        assert not [stamp_of(data) for data, expected in zip(self.answers, wanted, strict=True) if data != expected]
+
+
+@pytest.fixture
+def edge(start: Start) -> Iterator[Edge]:
     rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from geometry_msgs.msg import PoseStamped, TwistStamped
+    from geometry_msgs.msg import TwistStamped
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-    from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import TimeReference
 
     params = REPOSITORY / "config/outages.yaml"
     for name in ("controller", "error_detector"):
@@ -345,23 +361,41 @@ def test_ros2_bag_play_into_nodes_on_simulated_time(start: Start) -> None:
             f"agv_cloud.{name}_node", "--ros-args", "--params-file", str(params), "-p", "use_sim_time:=true",
             "-p", "wait_for_subscribers:=1",  # else the error detector may answer before the controller hears it
         )  # fmt: skip
-    bag = read_bag(SAMPLE)
-    overrides = yaml.safe_load((REPOSITORY / "config/play_qos.yaml").read_text())
     context = rclpy.Context()
     rclpy.init(context=context)
-    node = rclpy.create_node("rosbag2_player", context=context, use_global_arguments=False)
+    node = rclpy.create_node("listener", context=context, use_global_arguments=False)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     answers: list[bytes] = []
     node.create_subscription(TwistStamped, "edge/cmd_vel", answers.append, 1000, raw=True)
+
+    def spin_until(done: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 60.0
+        while not done() and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.001)
+
+    yield Edge(node, spin_until, answers)
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def test_what_ros2_bag_play_sends_is_answered_as_recorded(edge: Edge) -> None:
+    """What `ros2 bag play --clock --topics /edge/pose /edge/slot` sends, with config/rosbag2_qos.yaml."""
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import TimeReference
+
+    bag = read_bag(SAMPLE)
+    overrides = yaml.safe_load(QOS.read_text())
     topics = {"/edge/pose": PoseStamped, "/edge/slot": TimeReference}
     outputs = {
-        topic: node.create_publisher(
+        topic: edge.node.create_publisher(
             kind, topic, QoSProfile(depth=qos["depth"], reliability=ReliabilityPolicy[qos["reliability"].upper()])
         )
         for (topic, kind), qos in zip(topics.items(), map(overrides.get, topics), strict=True)
     }
-    clock = node.create_publisher(Clock, "/clock", 1)
+    clock = edge.node.create_publisher(Clock, "/clock", 1)
     messages = sorted(
         (int(row["log_time_ns"]), topic, data)
         for topic in topics
@@ -370,32 +404,30 @@ def test_ros2_bag_play_into_nodes_on_simulated_time(start: Start) -> None:
     begun = messages[0][0]
     ticks = [(ns, "/clock", encode_clock(ns)) for ns in range(begun, messages[-1][0], 25_000_000)]  # 40 Hz
     outputs["/clock"] = clock
-    wanted = bag.payloads("/edge/cmd_vel")
-
-    def spin_until(done: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 60.0
-        while not done() and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.01)
-
-    try:
-        spin_until(
-            lambda: (
-                all(output.get_subscription_count() for output in outputs.values())
-                and node.count_publishers("/edge/cmd_vel") == 1
-                and node.count_subscribers("/edge/error") == 1
-            )
+    edge.spin_until(
+        lambda: (
+            all(output.get_subscription_count() for output in outputs.values())
+            and edge.node.count_publishers("/edge/cmd_vel") == 1
+            and edge.node.count_subscribers("/edge/error") == 1
         )
-        started = time.monotonic_ns()
-        for ns, topic, data in sorted([*messages, *ticks]):
-            while time.monotonic_ns() - started < ns - begun:
-                executor.spin_once(timeout_sec=0.001)
-            outputs[topic].publish(data)
-        spin_until(lambda: len(answers) >= len(wanted))
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
-    assert not {stamp_of(data) for data in wanted} - {stamp_of(data) for data in answers}
-    assert not [stamp_of(data) for data, expected in zip(answers, wanted, strict=True) if data != expected]
+    )
+    started = time.monotonic_ns()
+    for ns, topic, data in sorted([*messages, *ticks]):
+        edge.spin_until(lambda: time.monotonic_ns() - started >= ns - begun)  # noqa: B023, which is over by the next
+        outputs[topic].publish(data)
+    edge.await_answers()
+
+
+def test_ros2_bag_play_itself_is_answered_as_recorded(edge: Edge, start: Start) -> None:
+    ros2 = shutil.which("ros2")
+    if ros2 is None or importlib.util.find_spec("rosbag2_py") is None:
+        pytest.skip("needs rosbag2, which is part of ROS 2 and not of its wheels")
+    edge.spin_until(lambda: edge.node.count_subscribers("/edge/error") == 1)
+    start(
+        ros2, "bag", "play", str(SAMPLE), "--clock", "--topics", "/edge/pose", "/edge/slot",
+        "--qos-profile-overrides-path", str(QOS), "--delay", "5", stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    edge.await_answers()
 
 
 # -- driven again ------------------------------------------------------------------------------------------------------
