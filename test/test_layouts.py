@@ -214,6 +214,16 @@ def test_rviz_shows_every_display() -> None:
     assert manager["Global Options"]["Fixed Frame"] == "map"
 
 
+def test_rviz_leaves_room_for_the_view() -> None:
+    # without a size the window is small, and a wide panel such as Time leaves nothing of the view beside it
+    layout = yaml.safe_load((CONFIG / "agv_ncs.rviz").read_text())
+    assert [panel["Class"] for panel in layout["Panels"]] == ["rviz_common/Displays"]
+    window = layout["Window Geometry"]
+    assert window["Width"] >= 1000
+    assert window["Height"] >= 700
+    assert window["Hide Right Dock"]
+
+
 def test_rviz_subscribes_to_what_there_is(sample: Bag) -> None:
     kinds = {
         "rviz_default_plugins/Path": "nav_msgs/msg/Path",
