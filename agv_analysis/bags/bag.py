@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -103,21 +103,23 @@ def read_bag(path: Path | str, topics: Collection[str] | None = None, progress: 
     """
     path = Path(path)
     contents = locate(path)
-    reading = _Reading(topics)
-    for number, storage in enumerate(open_files(contents)):
-        for channel, batch in storage.batches(reading.is_wanted):
-            reading.take(storage, channel, batch)
-            if progress is not None:
-                share = storage.position / max(1, storage.size)
-                progress(int(100 * (number + share) / len(contents.files)))
-        reading.finish(storage)
-    return reading.bag(path, contents)
+    with ThreadPoolExecutor(1, "pages") as helper:
+        reading = _Reading(topics, helper)
+        for number, storage in enumerate(open_files(contents)):
+            for channel, batch in storage.batches(reading.is_wanted):
+                reading.take(storage, channel, batch)
+                if progress is not None:
+                    share = storage.position / max(1, storage.size)
+                    progress(int(100 * (number + share) / len(contents.files)))
+            reading.finish(storage)
+        return reading.bag(path, contents)
 
 
 class _Reading:
     """What has been read so far, over all files of a bag."""
 
-    def __init__(self, topics: Collection[str] | None) -> None:
+    def __init__(self, topics: Collection[str] | None, helper: Executor) -> None:
+        self._helper = helper
         self._wanted = None if topics is None else frozenset(topics)
         self._findings = Findings()
         self._known: dict[str, tuple[Channel, Schema | None]] = {}
@@ -173,7 +175,8 @@ class _Reading:
                 if contradicts(schema.name, schema.text, channel.metadata.get(TYPE_HASH, "")):
                     what = "definition of its type that has not the hash recorded with it, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
-                self._tables[topic] = Table(kind, storage.expected(channel.id), storage.size > LARGE)
+                helper = self._helper if storage.size > LARGE else None
+                self._tables[topic] = Table(kind, storage.expected(channel.id), helper)
         except UndecodableError as error:
             self._refuse(topic, error)
         return self._tables.get(topic)

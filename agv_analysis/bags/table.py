@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.errors import UndecodableError
 from agv_analysis.bags.express import MAX_LAYOUTS, Run, compiled_place, recipes
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
+from agv_analysis.bags.pages import PagesAhead
 from agv_analysis.bags.schema import STRING, Struct
 
 _MISFITS_BELIEVED = 100
@@ -76,8 +78,11 @@ def _columns(kind: Struct, prefix: str = "", dims: tuple[int, ...] = ()) -> Iter
 class Table:
     """Columns of a topic: `log_time_ns`, `publish_time_ns`, and one for each value of its type."""
 
-    def __init__(self, kind: Struct, expected: int = 0, is_large: bool = False) -> None:
-        """`expected`: messages to make room for; more may come. `is_large`: so many that compiled code pays."""
+    def __init__(self, kind: Struct, expected: int = 0, helper: Executor | None = None) -> None:
+        """`expected`: messages to make room for; more may come.
+
+        `helper` makes memory ready; it is given where messages are so many that this, and compiled code, pay.
+        """
         self._columns = {LOG_TIME: _Column("i8", []), PUBLISH_TIME: _Column("i8", []), **dict(_columns(kind))}
         self._ragged = kind.has_sequences
         self._expected = expected
@@ -85,11 +90,13 @@ class Table:
         self._plans: dict[int, tuple[list[Run], list[Leaf]]] = {}
         self._dtype = self._make_dtype()
         self._store = np.empty(0, np.uint8)
+        self._helper = helper
+        self._pages = PagesAhead(self._store, helper)
         self._capacity = 0
         self._count = 0
         self._message_bytes = 0
         self.layouts = Layouts(kind)
-        self._place = compiled_place() if is_large and not self._ragged else None
+        self._place = compiled_place() if helper is not None and not self._ragged else None
         self._recipes = recipes([])
         self._express: dict[tuple[int, int], tuple[int, Layout]] = {}
         self._clock = np.array([-1, 0], np.int64)
@@ -194,6 +201,7 @@ class Table:
         """Make room for so many more rows."""
         if self._count + number > self._capacity:
             self._move(self._dtype, self._count + number, max(2 * self._capacity, self._expected))
+        self._pages.reach((self._count + number) * self._dtype.itemsize)
 
     def _move(self, dtype: np.dtype[np.void], rows: int, room: int) -> None:
         """Move the rows to a new store for `rows` rows, or for `room` if that is more and not too much."""
@@ -206,6 +214,7 @@ class Table:
         old = self.rows
         self._capacity = max(rows, min(room, _MAX_ROOM // dtype.itemsize))
         self._store = np.zeros(self._capacity * dtype.itemsize, np.uint8)  # what pads a row is zero, too
+        self._pages = PagesAhead(self._store, self._helper)
         self._dtype = dtype
         new = self.rows
         if old.dtype == dtype:

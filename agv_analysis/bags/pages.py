@@ -1,0 +1,47 @@
+"""New memory in time: its pages are asked for on another thread, before they are written to.
+
+The kernel gives memory page by page at the first write, and clears each; of a large bag that takes as long as all the
+copying into it, and the writer waits. Where the kernel does not know the request (Linux before 5.14), that stays so.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import sys
+from concurrent.futures import Executor
+
+from agv_analysis.bags.batch import Bytes
+
+_WINDOW = 2**24
+"""Bytes that are asked for at a time."""
+
+_MADV_POPULATE_WRITE = 23
+"""In <linux/mman.h>: makes pages as a write would, and leaves alone what is in those that are there."""
+
+
+class PagesAhead:
+    """The pages of an array that is written from its beginning to its end."""
+
+    def __init__(self, array: Bytes, helper: Executor | None) -> None:
+        """`helper` is where the kernel is waited for; without one nothing is asked for ahead."""
+        self._array = array
+        self._helper = helper if sys.platform == "linux" else None
+        self._asked = 0
+
+    def reach(self, end: int) -> None:
+        """Writing goes on up to byte `end`: ask for what comes behind it, if that has not been done."""
+        while self._helper is not None and self._asked < min(end + _WINDOW, len(self._array)):
+            self._helper.submit(_populate, self._array, self._asked)
+            self._asked += _WINDOW
+
+
+def _populate(array: Bytes, begin: int) -> None:
+    """Ask for the whole pages of a window; a refusal does no harm."""
+    page, address = mmap.PAGESIZE, array.ctypes.data
+    first = -(-(address + begin) // page) * page
+    end = (address + min(begin + _WINDOW, len(array))) // page * page
+    if first < end:  # by ctypes, which lets go of Python's lock; mmap's own `madvise` does not
+        request = ctypes.CDLL(None).madvise
+        request.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
+        request(first, end - first, _MADV_POPULATE_WRITE)
