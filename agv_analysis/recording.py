@@ -188,7 +188,7 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
     )
     unknown = () if knows or not scenario.plant.is_noisy else (_NO_TRUTH,)
     return dataclasses.replace(
-        run, notes=(*bag.problems, *_replayed(bag), *_notes(on_steps, names), *_mismatch(run), *unknown)
+        run, notes=(*bag.problems, *_replayed(bag), *_begun(run), *_notes(on_steps, names), *_mismatch(run), *unknown)
     )
 
 
@@ -321,6 +321,15 @@ def _replayed(bag: Bag) -> Iterator[str]:
     source = bag.metadata.get(METADATA_NAME, {}).get(REPLAY_OF)
     if source is not None:
         yield f"a replay of {source}: errors and commands are new, but the AGV moves as it did there, whatever they are"
+
+
+def _begun(run: Run) -> Iterator[str]:
+    first = int(run.k[0])
+    if first > 0:
+        yield (
+            f"it begins with step {first}, {first * run.scenario.plant.ts:g} s after the run's beginning: settling and "
+            "overshoot are those from there on, of the error that was left"
+        )
 
 
 def _notes(on_steps: Mapping[str, OnSteps], names: Mapping[str, str]) -> Iterator[str]:

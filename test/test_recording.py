@@ -159,6 +159,8 @@ def test_a_recording_that_begins_and_ends_in_the_middle_is_whole(tmp_path: Path)
     run = read_run(changed_bag(tmp_path / "bag.mcap", cut))
     assert not run.unexplained
     assert (run.k[0], run.k[-1]) == (302, 900)
+    assert [note for note in run.notes if "begins with step 302, 1.51 s after" in note]
+    assert not [note for note in read_run(SAMPLE).notes if "begins with" in note]
 
 
 def test_a_relay_that_was_started_again_and_names_no_pose_makes_none_older(tmp_path: Path) -> None:
