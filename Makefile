@@ -15,7 +15,7 @@ export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
 	$(BIN)/agv-ncs run config/outages.yaml --bag $(DEMO)
-	$(BIN)/agv-ncs analyse $(DEMO) --json $(DEMO)/analysis.json
+	$(BIN)/agv-ncs analyse $(DEMO) --json $(DEMO)/analysis.json --report $(DEMO)/report.html
 
 test: $(VENV)/test.stamp ## style, types and tests
 	$(BIN)/ruff check .

@@ -63,7 +63,7 @@ def between(begin: str, end: str, block: str, text: str) -> str:
 def demo_block(analysed: str) -> str:
     """The part of README.md that shows what the demo prints, from what `analyse` printed; paths are the demo's."""
     table = "\n".join(line.rstrip() for line in re.split(r"\nbag: ", analysed)[0].splitlines())
-    return f"```\n{table}\nbag:     bags/demo\npicture: bags/demo/overview.png\n```\n"
+    return f"```\n{table}\nbag:     bags/demo\npicture: bags/demo/overview.png\nreport:  bags/demo/report.html\n```\n"
 
 
 def readme_with(block: str) -> str:
