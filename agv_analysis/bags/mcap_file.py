@@ -80,14 +80,14 @@ from agv_analysis.bags.source import Record, Source
 from agv_analysis.bags.storage import LARGE, IsWanted
 
 _WINDOW = 2**20
-_TOGETHER = 2**22
+_TOGETHER = 2**20
 """Bytes of chunks, when inflated, that go to the other thread at a time."""
 
 _MOST_TOGETHER = 1000
 """Chunks that do so at most, however small they are."""
 
 _AHEAD = 3 * _TOGETHER
-"""Bytes that may be inflated ahead, unless a single chunk has more."""
+"""Bytes that may be inflated ahead, unless a single chunk has more; a processor's cache holds them until their turn."""
 
 _MAX_DAMAGES = 10_000
 """So many damaged places are passed over in a file."""
