@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -44,6 +45,9 @@ _domain, _claim = _claim_domain()
 os.environ["ROS_DOMAIN_ID"] = str(_domain)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["PYTHONUNBUFFERED"] = "1"
+
+# What a shell starts in the background ignores Ctrl-C, and so does all that it starts; here tests press it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples every time, however busy the machine.
 hypothesis.settings.register_profile("agv_ncs", deadline=None, derandomize=True, database=None)
