@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_plant.channel_setup import UPLINK, Segment, floor_of, levels_of, segments_of
 from agv_plant.channels import GOOD, Model
 from agv_plant.channels.delay import EXPIRED, delays_of, whole_slots
 from agv_plant.channels.installed import SHARED, TRACE, ChannelError, find_model
-from agv_plant.channels.placed import NOWHERE, UPLINK, floor_of, kind_of, levels_of, verdict_at
-from agv_plant.channels.schedule import OUTAGE, Segment, is_scripted, segments_of
+from agv_plant.channels.placed import NOWHERE, kind_of, verdict_at
+from agv_plant.channels.schedule import OUTAGE, is_scripted
 from agv_plant.channels.shared import SCHEDULERS, serve, stream_of
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters

@@ -262,7 +262,7 @@ def test_moving_a_slider_simulates_anew(page: Page) -> None:
 def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    from agv_analysis.commands.stability import rows
+    from agv_analysis.margin_table import rows
     from agv_analysis.stability.margins import margins
 
     def expected(kx: float) -> dict[str, str]:

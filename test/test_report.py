@@ -467,6 +467,14 @@ def test_theory_s_border_is_drawn_in_a_sweep_s_curve() -> None:
     assert x == pytest.approx((2.0 - a) / (2.0 + a), abs=0.01)
 
 
+def test_margins_in_a_page_are_plain_text() -> None:
+    """The terminal would take brackets for a colour; a page shows what escapes them."""
+    lossy = [f"relay.{link}.{setting}" for link in ("uplink", "downlink") for setting in ("model=bernoulli", "p=0.1")]
+    text = render(analyse(simulate(scenario_of(*lossy, "plant.duration=5.0"))))
+    assert "E[e^2] dies out, times" in text
+    assert "E\\[" not in text
+
+
 def test_a_reference_that_the_parameters_do_not_name_has_no_margins_and_says_so(lap: Analysis) -> None:
     run = simulate(scenario_of("plant.duration=5.0"))
     moved = dataclasses.replace(run, reference=run.reference + np.array([0.0, 0.1, 0.0, 0.0, 0.0]))

@@ -34,7 +34,8 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
     What cannot be simulated has no rows: the page says why at once.
     """
     from agv_analysis.analysis import analyse
-    from agv_analysis.report.page import margin_rows, sentence
+    from agv_analysis.margin_table import margin_rows
+    from agv_analysis.report.page import sentence
     from agv_analysis.simulation.single import simulate
 
     try:

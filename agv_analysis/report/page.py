@@ -19,7 +19,6 @@ from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
 from agv_analysis.run import Run
-from agv_analysis.scenario import Scenario
 from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 from agv_analysis.version import version
 from agv_cloud.reference import Reference
@@ -175,22 +174,13 @@ def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
         yield name, Text.from_markup(value).plain
 
 
-def margin_rows(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Name and value of each margin of a scenario over its track, and what none of them knows of."""
-    from agv_analysis.commands.stability import rows
-    from agv_analysis.stability.margins import margins
-
-    found = margins(scenario)
-    yield from rows(found, scenario.plant.ts)
-    if found.left_out:
-        yield "Left out of all of these", ", ".join(found.left_out)
-
-
 def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
     """Margins over the track of a run, or why there are none."""
     if not isinstance(analysis, Analysis):
         yield "Margins", f"not computed: {GAINS_UNKNOWN}"
         return
+    from agv_analysis.margin_table import margin_rows
+
     try:
         if _drives_its_track(analysis.run):
             yield from margin_rows(analysis.run.scenario)

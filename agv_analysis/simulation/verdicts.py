@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.simulation.chance import normals
 from agv_analysis.simulation.on_air import Way
+from agv_plant.channel_setup import Segment, floor_of, levels_of, segments_of
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.delay import NEVER, delays_of, soonest
 from agv_plant.channels.installed import SHARED, TRACE, find_model
-from agv_plant.channels.placed import floor_of, kind_of, levels_of
-from agv_plant.channels.schedule import Segment, is_scripted, segments_of
+from agv_plant.channels.placed import kind_of
+from agv_plant.channels.schedule import is_scripted
 from agv_plant.channels.shared import SCHEDULERS, serve_all, stream_of
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import Channel, delay_draws, draws, losses, own_stream

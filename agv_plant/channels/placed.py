@@ -8,15 +8,9 @@ the place. The relay knows the place from the poses that it passes on; the downl
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from agv_plant.channels.coverage_hole import Table, coverage_hole, is_in_hole
-from agv_plant.channels.coverage_hole import rows_of as holes
 from agv_plant.channels.rayleigh import fading_gain, rayleigh
-from agv_plant.channels.rayleigh import rows_of as waves
-
-if TYPE_CHECKING:
-    from agv_plant.parameters import ChannelParameters
 
 NOWHERE = (math.nan, math.nan)
 """The place of an AGV that has not been heard of: in no hole, in no fade."""
@@ -26,36 +20,16 @@ EVERYWHERE, COVERAGE_HOLE, RAYLEIGH = range(3)
 PLACED = ("", "coverage_hole", "rayleigh")
 """Models by name, each at the place of its number; the first stands for all others."""
 
-UPLINK = "uplink"
-"""The stream with which a correlated channel has its random numbers or its field in common."""
-
 
 def kind_of(model: str) -> int:
     """Number of the model called `model`: EVERYWHERE if it does not depend on the place."""
     return PLACED.index(model) if model in PLACED else EVERYWHERE
 
 
-def floor_of(channel: ChannelParameters, seed: int, stream: str) -> list[list[float]]:
-    """What the channel's model needs to know of the floor: rows of five numbers.
-
-    `correlation` is the coefficient of correlation between the complex gains of a fading downlink and uplink.
-    """
-    if channel.model == "rayleigh":
-        shared = channel.correlation**2 if stream != UPLINK else 0.0
-        own = waves(seed, stream, channel.carrier, 1.0 - shared) if shared < 1.0 else []
-        return [*own, *(waves(seed, UPLINK, channel.carrier, shared) if shared > 0.0 else [])]
-    return holes(channel.hole_circles, channel.hole_polygons)
-
-
-def levels_of(channel: ChannelParameters) -> tuple[float, float]:
-    """The two numbers of a placed model that may change while it runs."""
-    return (channel.margin, 0.0) if channel.model == "rayleigh" else (channel.p, channel.hole_loss)
-
-
 def verdict_at(kind: int, floor: Table, level: float, other: float, u: float, x: float, y: float) -> tuple[bool, float]:
     """Is a message lost that is sent at the place (x, y) [m], and the channel's gain there [dB], NaN if it has none.
 
-    `kind` is COVERAGE_HOLE or RAYLEIGH, `level` and `other` are its `levels_of`, `u` is uniform in [0, 1).
+    `kind` is COVERAGE_HOLE or RAYLEIGH, `level` and `other` are its two levels, `u` is uniform in [0, 1).
     """
     if kind == RAYLEIGH:
         gain = fading_gain(x, y, floor)

@@ -8,16 +8,12 @@ time takes a value, or everything is lost for 0.3 s, once or again every 5 s. Ti
 
 from __future__ import annotations
 
-import dataclasses
 import re
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 from agv_plant.channels.delay import whole_slots
 from agv_ros.parameters import Parameter, ParameterError
-
-if TYPE_CHECKING:
-    from agv_plant.parameters import ChannelParameters
 
 OUTAGE = "outage"
 """The word for a scripted outage, in a schedule and as the cause of a loss."""
@@ -80,30 +76,3 @@ def is_scripted(k: int, at: float, length: float, period: float, ts: float) -> b
     if period > 0.0:
         return since >= 0 and since % whole_slots(period / ts) < slots
     return 0 <= since < slots
-
-
-class Segment(NamedTuple):
-    """Slots in which a channel does not change: from slot `first` on."""
-
-    first: int
-    channel: ChannelParameters
-    outage: Outage
-
-
-def segments_of(channel: ChannelParameters, ts: float) -> tuple[Segment, ...]:
-    """A channel cut where its schedule changes it; the first segment begins with slot 0."""
-    found = [Segment(0, channel, Outage())]
-    for at, name, value, outage in channel.entries:
-        first, last = whole_slots(at / ts), found[-1]
-        changed = (
-            last._replace(first=first, outage=outage)
-            if name == OUTAGE
-            else last._replace(first=first, channel=_with(last.channel, name, value))
-        )
-        found = [*(found[:-1] if last.first == first else found), changed]
-    return tuple(found)
-
-
-def _with(channel: ChannelParameters, name: str, value: float) -> ChannelParameters:
-    replace: Callable[..., ChannelParameters] = dataclasses.replace
-    return replace(channel, **{name: value})
