@@ -1,16 +1,9 @@
-"""Running a whole scenario on DDS, or a fleet of them: all nodes in this process, or one process for each."""
+"""Running a whole scenario on DDS, or a fleet of them, with all nodes in this process."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
-import re
-import signal
-import subprocess
-import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -18,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-import click
 import rclpy
 import rclpy.logging
 from rclpy.executors import Executor
@@ -29,16 +21,16 @@ from agv_analysis.parameters import RecorderParameters
 from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.replay import EdgeInputs
 from agv_analysis.replay_node import Pace, ReplayNode, ReplayRecorder
-from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
+from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
-from agv_plant.plant_node import PlantNode, progress_line, progress_of
+from agv_plant.plant_node import PlantNode
 from agv_plant.radio import check_length
 from agv_plant.relay_node import RelayNode
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
-from agv_ros.parameters import LoopParameters, as_dict
+from agv_ros.parameters import LoopParameters
 from agv_ros.wire import Command, TrackingError
 
 N = TypeVar("N", bound=LoopNode[Any])
@@ -51,37 +43,17 @@ NODES: dict[str, Callable[..., LoopNode[Any]]] = {
     "controller": ControllerNode,
 }
 
-_MODULES = {
-    "plant": "agv_plant.plant_node",
-    "relay": "agv_plant.relay_node",
-    "error_detector": "agv_cloud.error_detector_node",
-    "controller": "agv_cloud.controller_node",
-    "recorder": "agv_analysis.recorder_node",
-}
-
 _PATIENCE = 15.0
 """How long [s] a run that is interrupted waits for its recorder, if there is one that lags: nothing shall be lost.
 
 DDS says only every 3 s that a message is there which a busy reader has missed.
 """
 
-_STOP_TIMEOUT = 20.0
-"""How long [s] a process that was asked to stop may take; more than `_PATIENCE`."""
-
-_LOOK_PERIOD = 0.1
-"""How often [s] the processes are looked at while they run."""
-
 _EVENTS_PER_LOOK = 256
 """How many events pass between two calls of `progress`."""
 
-_SAY_PERIOD = 0.2
-"""How often [s] a vehicle's process says how far it is."""
-
 _OWN_TOPICS = ["--ros-args", "-r", "/clock:=clock", "-r", "/diagnostics:=diagnostics"]
 """What makes of the topics of all nodes those of a namespace: each vehicle of a fleet has a clock of its own."""
-
-_LOG_PREFIX = re.compile(r"^\[[A-Z]+\] \[[0-9.]+\] \[[^]]*\]: ")
-"""What rclpy's logging puts before a line: severity, time, node."""
 
 Progress = Callable[[int], None]
 """Called with the number of steps done, every now and then."""
@@ -126,7 +98,7 @@ def run_fleet(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progres
 
 def loop_of(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: str = "") -> Loop:
     """The nodes of a scenario, in a namespace if they are a vehicle of a fleet."""
-    connected = _connected(scenario, recorded=bag is not None)
+    connected = scenario_that_waits(scenario, recorded=bag is not None)
     if vehicle:  # what nodes have to say beside warnings is in the fleet's table
         rclpy.logging.set_logger_level(vehicle, rclpy.logging.LoggingSeverity.WARN)
     plant = process.add(PlantNode, connected.plant, domain_id=connected.domain_of("plant"), vehicle=vehicle)
@@ -136,9 +108,9 @@ def loop_of(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: 
         for name in SCHEMAS
         if name != "plant"
     ]
-    with _params_file(scenario) as params:
+    with params_file(scenario) as params:
         recorder = (
-            None if bag is None else process.add_recorder(_recording(scenario, bag, params), RecorderNode, vehicle)
+            None if bag is None else process.add_recorder(recording_of(scenario, bag, params), RecorderNode, vehicle)
         )
     return Loop(plant, [plant, *others], recorder)
 
@@ -152,7 +124,7 @@ def replay_in_process(
     """
     recorded, predicts = bag is not None, scenario.error_detector.policy == "predict"
     listeners = {"error_detector": 2 + recorded, "controller": 1 + predicts + recorded}
-    with stop_on_signals() as stop, _params_file(scenario) as params, OneProcess(inputs.namespace) as process:
+    with stop_on_signals() as stop, params_file(scenario) as params, OneProcess(inputs.namespace) as process:
         player = process.add(
             partial(ReplayNode, inputs, pace, not starts_edge),
             LoopParameters(scenario.plant.ts, scenario.plant.start_time, 1 + recorded),
@@ -166,7 +138,7 @@ def replay_in_process(
         if bag is not None:
             own = [node.get_fully_qualified_name().lstrip("/") for node in nodes]
             make = partial(ReplayRecorder, inputs.source, own)
-            player.recorder = process.add_recorder(_recording(scenario, bag, params), make)
+            player.recorder = process.add_recorder(recording_of(scenario, bag, params), make)
             player.recorder.player = player
         executor = EXECUTORS["events"](context=process.context)
         outcome = run_loops(executor, [Loop(player, nodes, player.recorder)], stop, progress)[0]
@@ -266,7 +238,7 @@ class _Watch:
         self._unfinished = list(self._plants)
         self._stop, self._progress = stop, progress
         self._asked = 0
-        self.paces = [_Pace() for _ in loops]
+        self.paces = [Speedometer() for _ in loops]
 
     def is_done(self) -> bool:
         """Have all loops ended, or is all to stop? Asked after each event."""
@@ -284,7 +256,7 @@ class _Watch:
         self._progress(sum(plant.k for plant in self._plants))
 
 
-def _connected(scenario: Scenario, recorded: bool) -> Scenario:
+def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
     """The scenario with nodes that wait for each other, and for the recorder.
 
     Raises TraceError as the nodes would, and UserError if they would wait for ever.
@@ -304,7 +276,8 @@ def _connected(scenario: Scenario, recorded: bool) -> Scenario:
     return Scenario(**nodes)
 
 
-def _recording(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
+def recording_of(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
+    """What the recorder of a scenario is to do; `params` is the file of its parameters."""
     log_time = "stamp" if scenario.plant.clock == "lockstep" else "receive"
     return RecorderParameters(
         bag=str(bag), params_file=str(params), log_time=log_time, stop_timeout=_PATIENCE,
@@ -313,7 +286,7 @@ def _recording(scenario: Scenario, bag: Path, params: Path) -> RecorderParameter
 
 
 @contextmanager
-def _params_file(scenario: Scenario) -> Iterator[Path]:
+def params_file(scenario: Scenario) -> Iterator[Path]:
     """A file with the scenario's parameters, for as long as it is needed."""
     with tempfile.TemporaryDirectory(prefix="agv_ncs_") as folder:
         path = Path(folder) / "params.yaml"
@@ -321,7 +294,7 @@ def _params_file(scenario: Scenario) -> Iterator[Path]:
         yield path
 
 
-class _Pace:
+class Speedometer:
     """Speed between the first and the last step that was seen."""
 
     def __init__(self) -> None:
@@ -339,176 +312,3 @@ class _Pace:
         """Steps per second."""
         (k, begun), (end_k, ended) = self._first or self._last, self._last
         return (end_k - k) / (ended - begun) if end_k > k else 0.0
-
-
-def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -> Outcome:
-    """Run a scenario with one process for each node.
-
-    Raises UserError if a parameter, the track's file or the bag's path cannot be used.
-    """
-    connected = _connected(scenario, recorded=bag is not None)
-    with stop_on_signals() as stop, _params_file(scenario) as params, _params_file(connected) as connected_params:
-        nodes: dict[str, _Process] = {}
-        try:
-            if bag is not None:
-                recording = as_dict(_recording(scenario, bag, params))
-                nodes["recorder"] = _Process("recorder", _node_command("recorder", params, recording))
-            for name in reversed(SCHEMAS):
-                nodes[name] = _Process(name, _node_command(name, connected_params, {}), connected.domain_of(name))
-            outcome = _watch(nodes, stop, progress)
-            return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
-        finally:
-            for node in nodes.values():
-                node.stop(signal.SIGTERM)
-
-
-def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcome:
-    """Wait for the plant to end, then stop the others, the recorder last."""
-    plant = nodes["plant"]
-    while plant.is_running(_LOOK_PERIOD) and all(node.is_running() for node in nodes.values()) and not stop.requested:
-        progress(plant.steps)
-    ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
-    recorder = nodes.pop("recorder", None)
-    for node in nodes.values():
-        node.tell(signal.SIGINT)
-    for node in nodes.values():
-        node.collect()
-    if recorder is not None:
-        recorder.stop(signal.SIGINT)
-        nodes["recorder"] = recorder
-    progress(plant.steps)
-    if stop.requested:
-        failure = f"interrupted after step {plant.steps}"
-    elif ended:
-        failure = f"{ended[0].name} ended: {ended[0].last_words()}"
-    else:
-        failure = plant.last_words() if plant.status else ""
-    recording = recorder.last_words() if recorder else ""
-    failed = recorder is not None and recorder.status != 0
-    return Outcome(plant.steps, plant.pace.rate, failure, "" if failed else recording, recording if failed else "")
-
-
-def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress) -> list[Outcome]:
-    """As `run_fleet`, with one process for each vehicle: its nodes have one, as they cost most where they are apart."""
-    for scenario in fleet.values():  # what cannot be used is to be said once
-        _connected(scenario, recorded=bag is not None)
-    with stop_on_signals() as stop, ExitStack() as files:
-        vehicles: list[_Process] = []
-        try:
-            for name, scenario in fleet.items():
-                params = files.enter_context(_params_file(scenario))
-                command = [sys.executable, "-m", "agv_analysis.runner", name, str(params), str(bag or "")]
-                vehicles.append(_Process(name, command))
-            for vehicle in vehicles:
-                while vehicle.is_running(_LOOK_PERIOD) and not stop.requested:
-                    progress(sum(other.steps for other in vehicles))
-        finally:
-            for vehicle in vehicles:
-                vehicle.tell(signal.SIGINT)
-            for vehicle in vehicles:
-                vehicle.collect()
-        outcomes = [_outcome_of(vehicle, stop.requested) for vehicle in vehicles]
-        progress(sum(outcome.steps for outcome in outcomes))
-        return outcomes
-
-
-def _outcome_of(vehicle: _Process, stopped: bool) -> Outcome:
-    """What a vehicle's process says in its last line, unless something ended it before."""
-    try:
-        return Outcome(**json.loads(vehicle.last_words()))
-    except (ValueError, TypeError):
-        failure = f"interrupted after step {vehicle.steps}" if stopped else vehicle.last_words()
-        return Outcome(vehicle.steps, vehicle.pace.rate, failure, "", "")
-
-
-def _drive_vehicle(name: str, params: str, bag: str) -> None:
-    """Body of a vehicle's process: its progress goes to standard output and, as the last line, its Outcome."""
-    scenario = load_scenario(params)
-    steps, said = scenario.plant.duration / scenario.plant.ts, time.monotonic()
-
-    def say(k: int) -> None:
-        nonlocal said
-        if time.monotonic() - said > _SAY_PERIOD:
-            said = time.monotonic()
-            click.echo(progress_line(k, steps))
-
-    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, say)
-    click.echo(json.dumps(dataclasses.asdict(outcome)))
-
-
-def _node_command(name: str, params: Path, settings: dict[str, Any]) -> list[str]:
-    """Command that starts a node."""
-    command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
-    for parameter, value in settings.items():
-        command += ["-p", f"{parameter}:={json.dumps(value)}"]
-    return command
-
-
-class _Process:
-    """One node, or one vehicle, in a process of its own, with what it says."""
-
-    def __init__(self, name: str, command: Sequence[str], domain_id: int = -1) -> None:
-        self.name = name
-        self.steps = 0
-        self.pace = _Pace()
-        self._lines: list[str] = []
-        domain = {"ROS_DOMAIN_ID": str(domain_id)} if domain_id >= 0 else {}
-        # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order.
-        self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **domain},
-        )  # fmt: skip
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            text = _LOG_PREFIX.sub("", line.strip())
-            steps = progress_of(text)
-            if steps is None:
-                self._lines.append(text)
-            else:
-                self.steps = steps
-                self.pace.see(steps)
-
-    @property
-    def status(self) -> int | None:
-        """Exit status, None while it runs."""
-        return self._process.poll()
-
-    def is_running(self, wait: float = 0.0) -> bool:
-        """Does it still run after `wait` [s]?"""
-        try:
-            self._process.wait(wait)
-        except subprocess.TimeoutExpired:
-            return True
-        return False
-
-    def last_words(self) -> str:
-        """The last line that it printed."""
-        return self._lines[-1] if self._lines else f"exit status {self.status}, without a word"
-
-    def tell(self, number: signal.Signals) -> None:
-        """Send it a signal, unless it has ended."""
-        if self.is_running():
-            self._process.send_signal(number)
-
-    def stop(self, number: signal.Signals) -> None:
-        """Tell it to end, and see to it."""
-        self.tell(number)
-        self.collect()
-
-    def collect(self) -> None:
-        """Wait for its end, which comes by force if it takes too long, and for the rest of what it said."""
-        if self.is_running(_STOP_TIMEOUT):
-            self._process.kill()
-        self._process.wait()
-        self._reader.join()
-
-
-if __name__ == "__main__":
-    try:
-        _drive_vehicle(*sys.argv[1:])
-    except UserError as error:
-        raise SystemExit(str(error)) from None

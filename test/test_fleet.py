@@ -174,7 +174,7 @@ def test_a_vehicle_s_recording_is_its_simulation(driven: Path, name: str) -> Non
 
 
 def test_with_a_process_for_each_the_recordings_are_the_same_bytes(driven: Path, tmp_path: Path) -> None:
-    from agv_analysis.runner import run_fleet_in_processes
+    from agv_analysis.processes import run_fleet_in_processes
 
     outcomes = run_fleet_in_processes(fleet_of(3, *LOSSY), tmp_path, lambda _: None)
     assert [(found.steps, found.failure, found.recording_failure) for found in outcomes] == [(400, "", "")] * 3

@@ -19,7 +19,7 @@ LAYERS = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|(rosidl|ament|rmw|rosbag2|tf2|launch)(_.*)?")
 """Packages that there are on a machine with ROS only."""
 
-SPEAK_ROS = {"agv_ros.node", "agv_ros.executor", "agv_analysis.runner"}
+SPEAK_ROS = {"agv_ros.node", "agv_ros.executor", "agv_analysis.runner", "agv_analysis.processes"}
 """Beside the nodes themselves."""
 
 

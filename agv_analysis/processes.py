@@ -1,0 +1,227 @@
+"""Running a whole scenario on DDS with a process for each node, or a fleet with one for each vehicle."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+
+from agv_analysis.runner import (
+    Outcome,
+    Progress,
+    Speedometer,
+    params_file,
+    recording_of,
+    run_fleet,
+    scenario_that_waits,
+)
+from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
+from agv_plant.plant_node import progress_line, progress_of
+from agv_ros.errors import UserError
+from agv_ros.executor import Stop, stop_on_signals
+from agv_ros.parameters import as_dict
+
+_MODULES = {
+    "plant": "agv_plant.plant_node",
+    "relay": "agv_plant.relay_node",
+    "error_detector": "agv_cloud.error_detector_node",
+    "controller": "agv_cloud.controller_node",
+    "recorder": "agv_analysis.recorder_node",
+}
+
+_STOP_TIMEOUT = 20.0
+"""How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
+
+_LOOK_PERIOD = 0.1
+"""How often [s] the processes are looked at while they run."""
+
+_SAY_PERIOD = 0.2
+"""How often [s] a vehicle's process says how far it is."""
+
+_LOG_PREFIX = re.compile(r"^\[[A-Z]+\] \[[0-9.]+\] \[[^]]*\]: ")
+"""What rclpy's logging puts before a line: severity, time, node."""
+
+
+def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -> Outcome:
+    """Run a scenario with one process for each node.
+
+    Raises UserError if a parameter, the track's file or the bag's path cannot be used.
+    """
+    connected = scenario_that_waits(scenario, recorded=bag is not None)
+    with stop_on_signals() as stop, params_file(scenario) as params, params_file(connected) as connected_params:
+        nodes: dict[str, _Process] = {}
+        try:
+            if bag is not None:
+                recording = as_dict(recording_of(scenario, bag, params))
+                nodes["recorder"] = _Process("recorder", _node_command("recorder", params, recording))
+            for name in reversed(SCHEMAS):
+                nodes[name] = _Process(name, _node_command(name, connected_params, {}), connected.domain_of(name))
+            outcome = _watch(nodes, stop, progress)
+            return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
+        finally:
+            for node in nodes.values():
+                node.stop(signal.SIGTERM)
+
+
+def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcome:
+    """Wait for the plant to end, then stop the others, the recorder last."""
+    plant = nodes["plant"]
+    while plant.is_running(_LOOK_PERIOD) and all(node.is_running() for node in nodes.values()) and not stop.requested:
+        progress(plant.steps)
+    ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
+    recorder = nodes.pop("recorder", None)
+    for node in nodes.values():
+        node.tell(signal.SIGINT)
+    for node in nodes.values():
+        node.collect()
+    if recorder is not None:
+        recorder.stop(signal.SIGINT)
+        nodes["recorder"] = recorder
+    progress(plant.steps)
+    if stop.requested:
+        failure = f"interrupted after step {plant.steps}"
+    elif ended:
+        failure = f"{ended[0].name} ended: {ended[0].last_words()}"
+    else:
+        failure = plant.last_words() if plant.status else ""
+    recording = recorder.last_words() if recorder else ""
+    failed = recorder is not None and recorder.status != 0
+    return Outcome(plant.steps, plant.pace.rate, failure, "" if failed else recording, recording if failed else "")
+
+
+def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress) -> list[Outcome]:
+    """As `run_fleet`, with one process for each vehicle: its nodes have one, as they cost most where they are apart."""
+    for scenario in fleet.values():  # what cannot be used is to be said once
+        scenario_that_waits(scenario, recorded=bag is not None)
+    with stop_on_signals() as stop, ExitStack() as files:
+        vehicles: list[_Process] = []
+        try:
+            for name, scenario in fleet.items():
+                params = files.enter_context(params_file(scenario))
+                command = [sys.executable, "-m", "agv_analysis.processes", name, str(params), str(bag or "")]
+                vehicles.append(_Process(name, command))
+            for vehicle in vehicles:
+                while vehicle.is_running(_LOOK_PERIOD) and not stop.requested:
+                    progress(sum(other.steps for other in vehicles))
+        finally:
+            for vehicle in vehicles:
+                vehicle.tell(signal.SIGINT)
+            for vehicle in vehicles:
+                vehicle.collect()
+        outcomes = [_outcome_of(vehicle, stop.requested) for vehicle in vehicles]
+        progress(sum(outcome.steps for outcome in outcomes))
+        return outcomes
+
+
+def _outcome_of(vehicle: _Process, stopped: bool) -> Outcome:
+    """What a vehicle's process says in its last line, unless something ended it before."""
+    try:
+        return Outcome(**json.loads(vehicle.last_words()))
+    except (ValueError, TypeError):
+        failure = f"interrupted after step {vehicle.steps}" if stopped else vehicle.last_words()
+        return Outcome(vehicle.steps, vehicle.pace.rate, failure, "", "")
+
+
+def _drive_vehicle(name: str, params: str, bag: str) -> None:
+    """Body of a vehicle's process: its progress goes to standard output and, as the last line, its Outcome."""
+    scenario = load_scenario(params)
+    steps, said = scenario.plant.duration / scenario.plant.ts, time.monotonic()
+
+    def say(k: int) -> None:
+        nonlocal said
+        if time.monotonic() - said > _SAY_PERIOD:
+            said = time.monotonic()
+            click.echo(progress_line(k, steps))
+
+    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, say)
+    click.echo(json.dumps(dataclasses.asdict(outcome)))
+
+
+def _node_command(name: str, params: Path, settings: dict[str, Any]) -> list[str]:
+    """Command that starts a node."""
+    command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
+    for parameter, value in settings.items():
+        command += ["-p", f"{parameter}:={json.dumps(value)}"]
+    return command
+
+
+class _Process:
+    """One node, or one vehicle, in a process of its own, with what it says."""
+
+    def __init__(self, name: str, command: Sequence[str], domain_id: int = -1) -> None:
+        self.name = name
+        self.steps = 0
+        self.pace = Speedometer()
+        self._lines: list[str] = []
+        domain = {"ROS_DOMAIN_ID": str(domain_id)} if domain_id >= 0 else {}
+        # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order.
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **domain},
+        )  # fmt: skip
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            text = _LOG_PREFIX.sub("", line.strip())
+            steps = progress_of(text)
+            if steps is None:
+                self._lines.append(text)
+            else:
+                self.steps = steps
+                self.pace.see(steps)
+
+    @property
+    def status(self) -> int | None:
+        """Exit status, None while it runs."""
+        return self._process.poll()
+
+    def is_running(self, wait: float = 0.0) -> bool:
+        """Does it still run after `wait` [s]?"""
+        try:
+            self._process.wait(wait)
+        except subprocess.TimeoutExpired:
+            return True
+        return False
+
+    def last_words(self) -> str:
+        """The last line that it printed."""
+        return self._lines[-1] if self._lines else f"exit status {self.status}, without a word"
+
+    def tell(self, number: signal.Signals) -> None:
+        """Send it a signal, unless it has ended."""
+        if self.is_running():
+            self._process.send_signal(number)
+
+    def stop(self, number: signal.Signals) -> None:
+        """Tell it to end, and see to it."""
+        self.tell(number)
+        self.collect()
+
+    def collect(self) -> None:
+        """Wait for its end, which comes by force if it takes too long, and for the rest of what it said."""
+        if self.is_running(_STOP_TIMEOUT):
+            self._process.kill()
+        self._process.wait()
+        self._reader.join()
+
+
+if __name__ == "__main__":
+    try:
+        _drive_vehicle(*sys.argv[1:])
+    except UserError as error:
+        raise SystemExit(str(error)) from None
