@@ -218,12 +218,14 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
         spin(executor, watch.is_done)
         watch.look()
     finally:  # whatever ended the loops, what was recorded is kept
-        for loop in loops:
-            for node in loop.nodes:
-                node.close()
-                node.flush(_PATIENCE)
+        deadline = time.monotonic() + _PATIENCE
+        nodes = [node for loop in loops for node in loop.nodes]
+        for node in nodes:
+            node.close()
         recorders = [(loop.recorder, len(loop.nodes)) for loop in loops if loop.recorder]
-        spin_for(executor, lambda: all(recorder.has_all_of(nodes) for recorder, nodes in recorders), _PATIENCE)
+        spin_for(executor, lambda: all(recorder.has_all_of(number) for recorder, number in recorders), _PATIENCE)
+        for node in nodes:  # others may listen, too
+            node.flush(max(0.0, deadline - time.monotonic()))
         for recorder, _ in recorders:
             recorder.close()
         executor.shutdown()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -124,6 +125,13 @@ class Started:
             if text in line:
                 return self.lines[-1]
         pytest.fail(f"ended without a line with {text!r}:\n" + "\n".join(self.lines))
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Wait for something that it does elsewhere, in a file say; fails the test if the process ends before."""
+        while not condition():
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(0.05)
+                pytest.fail("ended too early:\n" + self.end()[1])
 
     def end(self, seconds: float = 60.0) -> tuple[int, str]:
         """Exit status and all that was said; `seconds` is only there so that a hanging test ends."""

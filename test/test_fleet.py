@@ -256,8 +256,7 @@ def test_an_interrupted_fleet_leaves_readable_bags_and_nothing_else(
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     bag, names = tmp_path / "fleet", vehicle_names(2)
     run = start("agv_analysis.cli", "run", PAPER, "--fleet", "2", "--duration", "10000", "--bag", str(bag), *how)
-    while not all(any(file.stat().st_size > 100_000 for file in (bag / name).glob("*.mcap")) for name in names):
-        assert run.process.poll() is None
+    run.until(lambda: all(any(file.stat().st_size > 100_000 for file in (bag / name).glob("*.mcap")) for name in names))
     children = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children").read_text().split()
     assert len(children) == (2 if how else 0)
     run.process.send_signal(signal.SIGINT)

@@ -108,8 +108,7 @@ def test_schemas_hold_what_rosbags_knows_of_the_types() -> None:
 def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) -> None:
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--bag", str(where))
-    while not (where.exists() and any(file.stat().st_size > 100_000 for file in where.glob("*.mcap"))):
-        assert run.process.poll() is None
+    run.until(lambda: any(file.stat().st_size > 100_000 for file in where.glob("*.mcap")))
     run.process.send_signal(signal.SIGINT)
     status, said = run.end()
     assert status == 1
@@ -123,8 +122,7 @@ def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) 
 def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, tmp_path: Path) -> None:
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
-    while not (where.exists() and any(file.stat().st_size > 100_000 for file in where.glob("*.mcap"))):
-        assert run.process.poll() is None
+    run.until(lambda: any(file.stat().st_size > 100_000 for file in where.glob("*.mcap")))
     run.process.send_signal(signal.SIGTERM)
     status, said = run.end()
     assert status == 1
