@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,12 +127,29 @@ class Started:
                 return self.lines[-1]
         pytest.fail(f"ended without a line with {text!r}:\n" + "\n".join(self.lines))
 
-    def until(self, condition: Callable[[], bool]) -> None:
-        """Wait for something that it does elsewhere, in a file say; fails the test if the process ends before."""
+    def until(self, condition: Callable[[], bool], seconds: float = 300.0) -> None:
+        """Wait for something that it does elsewhere, in a file say; fails the test if the process ends before.
+
+        `seconds` is only there so that a hanging test ends.
+        """
+        deadline = time.monotonic() + seconds
         while not condition():
+            assert time.monotonic() < deadline
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(0.05)
                 pytest.fail("ended too early:\n" + self.end()[1])
+
+    def until_recorded(self, *bags: Path) -> None:
+        """Wait until there are some hundred steps in each of the bags that it writes."""
+        self.until(lambda: all(any(file.stat().st_size > 100_000 for file in bag.glob("*.mcap")) for bag in bags))
+
+    def children(self) -> list[Path]:
+        """The processes that it has begun, from whichever thread, and that still run: their folders in Linux' /proc."""
+        found: list[str] = []
+        for begun in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
+            with contextlib.suppress(OSError):  # a thread may go while it is looked at
+                found += begun.read_text().split()
+        return [Path("/proc", child) for child in found]
 
     def end(self, seconds: float = 60.0) -> tuple[int, str]:
         """Exit status and all that was said; `seconds` is only there so that a hanging test ends."""

@@ -9,7 +9,6 @@ import os
 import re
 import signal
 import socket
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from http.client import HTTPException
@@ -380,27 +379,15 @@ def ask_for_the_lap(address: str, base: Scenario) -> None:
         urlopen(request, timeout=300.0).close()
 
 
-def has_children(pid: int) -> bool:
-    """Has a process begun another? By Linux' /proc, whose processes may go while it is read."""
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            if int(stat.read_text().rpartition(")")[2].split()[1]) == pid:
-                return True
-    return False
-
-
 def test_ctrl_c_ends_it_in_the_midst_of_the_lap_s_criteria(start: Start, base: Scenario) -> None:
     pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
     command = ("agv_analysis.cli", "explore", "config/outages.yaml", "--port", "0", "--no-browser")
     served = start(*command, start_new_session=True)
-    pid = served.process.pid
     address = served.wait_for("explore:").split()[1]
     with ThreadPoolExecutor(1) as threads:
         threads.submit(ask_for_the_lap, address, base)
-        deadline = time.monotonic() + 120.0
-        while not has_children(pid) and time.monotonic() < deadline:
-            time.sleep(0.02)
-        os.killpg(pid, signal.SIGINT)  # as a terminal does
+        served.until(lambda: bool(served.children()))
+        os.killpg(served.process.pid, signal.SIGINT)  # as a terminal does
         status, said = served.end()
     assert (status, "Traceback" in said) == (0, False), said[-500:]
 

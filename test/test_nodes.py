@@ -443,14 +443,8 @@ EDGE_OF_A_ROBOT = {"ts": 0.1, "track": "line", "speed": 0.2, "track_start": [0.0
 ROBOT_S_TOPICS = ["-r", "edge/pose:=diff_drive_controller/odom", "-r", "edge/cmd_vel:=diff_drive_controller/cmd_vel"]
 
 
-@pytest.mark.parametrize(
-    ("bench", "command_type", "through_the_relay"),
-    [  # each of a pair with each of another: it takes seconds
-        ("events", "twist_stamped", False), ("events", "twist", True),
-        ("single", "twist_stamped", True), ("single", "twist", False),
-    ],
-    indirect=["bench"],
-)  # fmt: skip
+@pytest.mark.parametrize("through_the_relay", [False, True], ids=["direct", "relay"])
+@pytest.mark.parametrize("command_type", ["twist_stamped", "twist"])
 def test_the_edge_drives_a_robot_that_is_not_ours_and_it_halts_without_the_edge(
     bench: Bench, command_type: str, through_the_relay: bool
 ) -> None:

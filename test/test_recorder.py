@@ -108,7 +108,7 @@ def test_schemas_hold_what_rosbags_knows_of_the_types() -> None:
 def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) -> None:
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--bag", str(where))
-    run.until(lambda: any(file.stat().st_size > 100_000 for file in where.glob("*.mcap")))
+    run.until_recorded(where)
     run.process.send_signal(signal.SIGINT)
     status, said = run.end()
     assert status == 1
@@ -122,7 +122,7 @@ def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) 
 def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, tmp_path: Path) -> None:
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
-    run.until(lambda: any(file.stat().st_size > 100_000 for file in where.glob("*.mcap")))
+    run.until_recorded(where)
     run.process.send_signal(signal.SIGTERM)
     status, said = run.end()
     assert status == 1
@@ -142,24 +142,18 @@ def test_an_interrupted_run_waits_for_a_recorder_that_lags(start: Start, tmp_pat
     listener.create_subscription(Clock, "/clock", seen.append, LOOP_QOS)
     executor.add_node(listener)
     assert spin_for(executor, lambda: len(seen) > 20, 60.0)
-    recorder = next(child for child in children(run.process.pid) if "recorder_node" in child.read_text())
-    os.kill(int(recorder.parent.name), signal.SIGSTOP)
+    recorder = next(child for child in run.children() if "recorder_node" in (child / "cmdline").read_text())
+    os.kill(int(recorder.name), signal.SIGSTOP)
     begun = len(seen)
     assert spin_for(executor, lambda: len(seen) > begun + 300, 60.0)
     run.process.send_signal(signal.SIGTERM)
-    os.kill(int(recorder.parent.name), signal.SIGCONT)
+    os.kill(int(recorder.name), signal.SIGCONT)
     listener.destroy_node()
     context.try_shutdown()
     _, said = run.end()
     assert "everything that was published" in said
     assert len(read_run(where)) > 300
     assert not read_run(where).unexplained
-
-
-def children(pid: int) -> list[Path]:
-    """The command lines of a process's children."""
-    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return [Path("/proc", child, "cmdline") for child in found]
 
 
 def test_the_recorder_says_what_it_has_missed(tmp_path: Path) -> None:

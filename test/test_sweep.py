@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import os
 import signal
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -372,9 +370,7 @@ def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(
         "--seeds=48", "--workers=1", "--out",
     )  # fmt: skip
     started = start("agv_analysis.cli", *map(str, (*arguments, tmp_path / "stopped")))
-    while started.process.poll() is None and not list((tmp_path / "stopped").glob("parts/*.npy")):
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            started.process.wait(0.02)
+    started.until(lambda: any((tmp_path / "stopped").glob("parts/*.npy")))
     started.process.send_signal(signal.SIGINT)
     status, output = started.end()
     assert status == 130, output

@@ -64,15 +64,12 @@ def command(
         _run_fleet(scenario, fleet, pitch, bag, processes)
         return
     with needs_ros():
-        from agv_analysis import processes as apart
-        from agv_analysis import runner
+        from agv_analysis.processes import run_in_processes
+        from agv_analysis.runner import run_in_process
     from agv_analysis.progress import step_bar
 
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
-        if processes:
-            outcome = apart.run_in_processes(scenario, bag, progress)
-        else:
-            outcome = runner.run_in_process(scenario, bag, progress)
+        outcome = (run_in_processes if processes else run_in_process)(scenario, bag, progress)
     click.echo(f"{outcome.steps} steps" + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
     if outcome.recording:
         click.echo(f"bag: {bag}: {outcome.recording}")
@@ -89,13 +86,13 @@ def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, p
 
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
     with needs_ros():
-        from agv_analysis import processes as apart
-        from agv_analysis import runner
+        from agv_analysis.processes import run_fleet_in_processes
+        from agv_analysis.runner import run_fleet
     if bag is not None:
         with new_directory(bag):
             pass  # each vehicle's recorder goes on in it
     with step_bar(count * scenario.plant.duration / scenario.plant.ts) as progress:
-        outcomes = (apart.run_fleet_in_processes if processes else runner.run_fleet)(fleet, bag, progress)
+        outcomes = (run_fleet_in_processes if processes else run_fleet)(fleet, bag, progress)
     ended = dict(zip(fleet, outcomes, strict=True))
     rate = sum(outcome.rate for outcome in outcomes)
     click.echo(
