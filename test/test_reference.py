@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from agv_analysis.simulation.reference import reference_of
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference, lap_steps, speeds_of
 from agv_cloud.track_file import TrackFileError
@@ -38,6 +39,7 @@ def test_it_is_the_euler_recursion_to_the_last_bit(track: str) -> None:
     reference = Reference(parameters)
     assert [tuple(reference[k]) for k in range(2500)] == expected
     assert Reference(parameters).first(2500).tolist() == [list(point) for point in expected]
+    assert reference_of(parameters, 2500).tolist() == [list(point) for point in expected]
 
 
 @settings(deadline=None, derandomize=True, max_examples=50)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -114,6 +114,17 @@ def test_a_short_lap_against_every_n(lap: Lap, track: str, kx: float) -> None:
     )
     found = largest_n(theta, v, ControllerParameters(kx=kx, ky=1.0, ktheta=2.0), TS)
     assert found == (None if broken is None else broken - 1)
+
+
+@settings(deadline=None, derandomize=True, max_examples=200)
+@given(st.floats(0.1, 900.0), st.floats(0.01, 3e4), st.floats(0.1, 900.0), speed)
+def test_it_fails_at_once_where_an_eigenvalue_of_a_fresh_pose_is_outside(
+    kx: float, ky: float, ktheta: float, v: float
+) -> None:
+    by, theta, speeds = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), np.array([0.7]), np.array([v])
+    radius = np.abs(np.linalg.eigvals(matrices(theta, theta, speeds, by, TS)[0])).max()
+    assume(abs(radius - 1.0) > 1e-9)  # nearer, numpy's rounding decides
+    assert (largest_n(theta, speeds, by, TS) == -1) == (radius > 1.0)
 
 
 @pytest.mark.parametrize("kx", [5.0, 25.0, 250.0])

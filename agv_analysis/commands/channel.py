@@ -55,7 +55,7 @@ def command(
     from agv_analysis.channel_netem import to_netem
     from agv_analysis.channel_study import draw, fitted, study, write_csv
     from agv_analysis.scenario import load_scenario
-    from agv_analysis.simulation.single import reference_of
+    from agv_analysis.simulation.reference import reference_of
     from agv_plant.channels.trace import load_trace
     from agv_ros.errors import UserError
 

@@ -22,6 +22,9 @@ from agv_ros.parameters import SHARED
 _MOST_POINTS = 1200
 """Points of a line: the lowest and the highest of each pixel or two."""
 
+_MOST_DOTS = 100
+"""Each of them costs a drawing more than twenty points of a line."""
+
 _PLACES = 100
 """Places of the track at which the lifted system is asked: all of them would take longer than the lap."""
 
@@ -47,7 +50,7 @@ def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
     values = list(told(run))
     others = [""] * len(values) if other is None else [value for _, value in told(other)]
     return Answer(
-        track=figure([first], _MOST_POINTS),
+        track=figure([first], _MOST_POINTS, dots=_MOST_DOTS),
         time=figure(over_time, _MOST_POINTS),
         rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
     )

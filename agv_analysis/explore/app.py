@@ -37,6 +37,7 @@ label { display: block; font-size: .85rem; color: var(--soft); margin-top: .3rem
 button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
 th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
 pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
+#lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
 .js-plotly-plot .main-svg text:not(.hovertext *) { fill: var(--ink) !important }
 .js-plotly-plot .gridlayer path { stroke: var(--line) !important }
 """
@@ -44,6 +45,15 @@ pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
 
 Lap = Callable[[Scenario, Scenario | None], list[tuple[str, str, str]] | None]
 """As `lap_beside`; None if the setting was moved on before its turn came."""
+
+_REST = 0.3
+"""Seconds for which the page has to be left alone before the lap's criteria are computed."""
+
+_AGAIN, _PAUSE = 4, 400
+"""How often a page that was loaded is drawn anew, and after how many milliseconds each.
+
+A browser compiles what it has run some times: so it has before a hand moves the first slider.
+"""
 
 _MOVED_ON = [("Not computed", "the page was moved on", "")]
 
@@ -83,12 +93,13 @@ def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
         html.Div("", id="problem", role="alert"),
         html.Table([], id="told"),
         html.H2("Over the whole lap"),
-        dcc.Loading(html.Table([], id="lap")),
+        html.Table([], id="lap"),
         dcc.Graph(id="plot-track", style={"height": "420px"}, config={"displaylogo": False}),
         dcc.Graph(id="plot-time", style={"height": "620px"}, config={"displaylogo": False}),
         html.Pre("", id="exported"),
         dcc.Download(id="file"),
         dcc.Store(id="pinned"),
+        dcc.Interval(id="again", interval=_PAUSE, max_intervals=_AGAIN),
     ]
     return html.Main([html.Div(controls, id="controls"), html.Div(shown, id="shown")])
 
@@ -107,27 +118,30 @@ def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
 
     @app.callback(
         Output("plot-track", "figure"), Output("plot-time", "figure"), Output("told", "children"),
-        Output("problem", "children"),
-        *inputs, Input("pinned", "data"),
+        Output("problem", "children"), Output("lap", "className"),
+        *inputs, Input("pinned", "data"), Input("again", "n_intervals"),
     )  # fmt: skip
     def move(*given: Any) -> Any:
-        *settings, pinned = given
+        *settings, pinned, _ = given
         try:
             other = None if pinned is None else scenario_of(base, pinned)
             found = answer(scenario_of(base, values(tuple(settings))), other)
         except UserError as error:
-            return dash.no_update, dash.no_update, dash.no_update, str(error)
-        return found.track, found.time, _table(dash.html, found.rows), ""
+            return dash.no_update, dash.no_update, dash.no_update, str(error), "old"
+        return found.track, found.time, _table(dash.html, found.rows), "", "old"
 
-    @app.callback(Output("lap", "children"), *inputs, Input("pinned", "data"))
-    def over_the_lap(*given: Any) -> Any:
+    @app.callback(
+        Output("lap", "children"), Output("lap", "className", allow_duplicate=True),
+        Input("problem", "children"), *states, State("pinned", "data"), prevent_initial_call=True,
+    )  # fmt: skip
+    def over_the_lap(_: Any, *given: Any) -> Any:  # after `move` has answered, so as not to keep it from that
         *settings, pinned = given
         try:
             scenario = scenario_of(base, values(tuple(settings)))
             found = lap(scenario, None if pinned is None else scenario_of(base, pinned))
         except UserError:  # `move` says why
-            return []
-        return _table(dash.html, _MOVED_ON if found is None else found)
+            return [], ""
+        return _table(dash.html, _MOVED_ON if found is None else found), ""
 
     @app.callback(
         Output("pinned", "data"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"), *states,
@@ -167,10 +181,11 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
 
     Raises UserError if the port is taken or Dash is not installed.
     """
-    lap = Newest(lap_beside)
+    lap = Newest(lap_beside, rest=_REST)
     app = build(base, lap)
     werkzeug: Any = importlib.import_module("werkzeug.serving")
-    quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), {"log": lambda *_: None})
+    lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections
+    quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
     try:
         server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet)
     except (OSError, SystemExit) as error:

@@ -17,7 +17,7 @@ from agv_ros.errors import UserError
 
 R = TypeVar("R")
 
-_NICE = 10
+_NICE = 19
 """What is computed beside gives way to the page and to the browser."""
 
 
@@ -53,10 +53,12 @@ class Newest(Generic[R]):
     """Makes calls in another process, one at a time; of those that wait for their turn only the newest is made.
 
     So a slider that is dragged does not leave a queue behind it, and the page's own process answers moves meanwhile.
+    A call waits `rest` seconds for a newer one before it takes its turn.
     """
 
-    def __init__(self, function: Callable[..., R]) -> None:
+    def __init__(self, function: Callable[..., R], rest: float = 0.0) -> None:
         self._function = function
+        self._rest = rest
         self._changed = threading.Condition()
         self._newest = 0
         self._busy = False
@@ -73,8 +75,9 @@ class Newest(Generic[R]):
             self._newest += 1
             mine = self._newest
             self._changed.notify_all()
-            self._changed.wait_for(lambda: not self._busy or mine != self._newest)
-            if mine != self._newest:
+            self._changed.wait_for(lambda: self._is_over(mine), self._rest)
+            self._changed.wait_for(lambda: not self._busy or self._is_over(mine))
+            if self._is_over(mine):
                 return None
             self._busy = True
         try:
@@ -83,6 +86,9 @@ class Newest(Generic[R]):
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
+
+    def _is_over(self, mine: int) -> bool:
+        return self._closed or mine != self._newest
 
     def _compute(self, arguments: tuple[Any, ...]) -> R | None:
         with self._of_process:
@@ -99,6 +105,8 @@ class Newest(Generic[R]):
             self._closed = True
             if self._process is not None:
                 self._process.terminate()
+        with self._changed:
+            self._changed.notify_all()
 
 
 def _begun() -> Any:

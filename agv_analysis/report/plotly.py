@@ -32,8 +32,8 @@ COLOURS = {REFERENCE: "#8a8a8a", DRIVEN: "#3b8bd0", LOST: "#e0453c", OTHER: "#e3
 MOST_POINTS = 20_000
 """Points of one line in a report; longer runs are thinned."""
 
-_LINE_PER_DOT = 4
-"""A point that is drawn by itself, an element of the page, takes as long as so many points of a line."""
+MOST_DOTS = 5000
+"""Of points that are drawn by themselves: each is an element of the page, and costs as much as many of a line."""
 
 _LONGEST_CAUSE = 60
 """Letters of a cause that are shown, at most."""
@@ -42,7 +42,7 @@ _GAP = 0.22
 """Share of a row that is left free above it, for its legend."""
 
 
-def figure(panels: Sequence[Panel], most: int = MOST_POINTS, revision: str = "") -> dict[str, Any]:
+def figure(panels: Sequence[Panel], most: int = MOST_POINTS, dots: int = MOST_DOTS) -> dict[str, Any]:
     """A figure of panels one below the other on one common x axis, which zooms all of them.
 
     Lines are drawn as vectors: without a graphics card WebGL takes seconds for what they take a tenth of one, and in
@@ -56,7 +56,7 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, revision: str = "")
         "plot_bgcolor": "rgba(0,0,0,0)",
         "modebar": {"bgcolor": "rgba(0,0,0,0)"},
         "hovermode": "closest" if panels[0].equal else "x",
-        "uirevision": revision or panels[0].key,
+        "uirevision": panels[0].key,
         "xaxis": {
             "title": {"text": panels[0].x_label}, "anchor": f"y{rows if rows > 1 else ''}", "zeroline": False,
         },
@@ -67,7 +67,8 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, revision: str = "")
         bottom = 1.0 - (row + 1) / rows
         layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel)}
         layout[f"legend{number}"] = {"orientation": "h", "x": 0.0, "y": top, "yanchor": "bottom"}
-        traces += [{**_trace(line, most), "yaxis": f"y{number}", "legend": f"legend{number}"} for line in panel.lines]
+        of_row = {"yaxis": f"y{number}", "legend": f"legend{number}"}
+        traces += [_trace(line, most, dots) | of_row for line in panel.lines]
     return {"data": traces, "layout": layout}
 
 
@@ -82,8 +83,8 @@ def _y_axis(panel: Panel) -> dict[str, Any]:
     return axis
 
 
-def _trace(line: Line, most: int) -> dict[str, Any]:
-    line = thinned(line, most // _LINE_PER_DOT if line.style == DOTS else most)
+def _trace(line: Line, most: int, dots: int) -> dict[str, Any]:
+    line = thinned(line, dots if line.style == DOTS else most)
     colour = COLOURS[line.role]
     trace: dict[str, Any] = {"name": line.name, "x": _packed(line.x), "y": _packed(line.y), "showlegend": True}
     if line.style == BARS:

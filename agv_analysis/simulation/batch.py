@@ -25,7 +25,8 @@ from agv_analysis.simulation.loop import (
     statistics_of_two,
 )
 from agv_analysis.simulation.on_air import Marks, blank, contraction_on_air, statistics_on_air
-from agv_analysis.simulation.single import reference_of, settings_of, steps_of
+from agv_analysis.simulation.reference import reference_of
+from agv_analysis.simulation.single import settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.motion import NOISE, SLIP

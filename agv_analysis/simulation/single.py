@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from pathlib import Path
 
 import numpy as np
 
@@ -15,8 +13,7 @@ from agv_analysis.simulation.chance import measurements, normals
 from agv_analysis.simulation.link import SimulatedLink
 from agv_analysis.simulation.loop import Case, Rows, Settings, at_rest, history
 from agv_analysis.simulation.on_air import history_on_air
-from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference
+from agv_analysis.simulation.reference import reference_of
 from agv_cloud.staleness import POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.motion import NOISE, SLIP, body_of
@@ -71,28 +68,6 @@ def _drive(reference: Rows, case: Case, up: SimulatedLink, down: SimulatedLink) 
     if up.is_direct and down.is_direct:
         return rows, compiled(history)(reference, case, rows, np.empty(len(rows), dtype=np.int64))
     return rows, compiled(history_on_air)(reference, case, up.way, down.way, up.marks, down.marks, rows)
-
-
-def reference_of(detector: ErrorDetectorParameters, steps: int) -> Floats:
-    """A reference track's first steps, shape (steps, 5); kept, since many runs ask for the same. Not to be written to.
-
-    Raises TrackFileError for a bad track file.
-    """
-    return _reference(detector, steps, _edition(detector.track_file))
-
-
-@functools.lru_cache(maxsize=8)
-def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -> Floats:
-    return Reference(detector).first(steps)
-
-
-def _edition(path: str) -> object:
-    """What changes when a file does; None if there is no such file."""
-    try:
-        found = Path(path).stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size
 
 
 def steps_of(scenario: Scenario) -> int:

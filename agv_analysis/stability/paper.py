@@ -12,6 +12,7 @@ eq. 55 has the commanded speed nu(k-n) instead of v_r(k-n) in A(3,2); `v_literal
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_cloud.parameters import ControllerParameters
@@ -76,7 +77,7 @@ def largest_n(theta: Floats, v_r: Floats, gains: ControllerParameters, ts: float
     For a pose held at step j the test fails from the step k on at which |theta(k) - theta(j)| first reaches a critical
     angle. That some pair at most n steps apart fails is monotone in n, and seen from sliding extremes of the heading.
     """
-    if not np.all(spectral_radii(theta, theta, v_r, gains, ts) < 1.0):
+    if not np.all(_holds_without_outages(v_r, gains, ts)):
         return -1
     critical = _critical_angles(v_r, gains, ts)
 
@@ -91,6 +92,12 @@ def largest_n(theta: Floats, v_r: Floats, gains: ControllerParameters, ts: float
         middle = (holds + broken) // 2
         holds, broken = (holds, middle) if fails(middle) else (middle, broken)
     return holds
+
+
+def _holds_without_outages(v: Floats, gains: ControllerParameters, ts: float) -> NDArray[np.bool_]:
+    """Whether the test holds for Delta = 0: the cubic is (mu - a) (mu^2 - b mu + c), asked by Jury's criterion."""
+    a, b, c = ts * gains.kx, ts * gains.ktheta * v, ts * ts * gains.ky * v * v
+    return np.asarray((0.0 < a < 2.0) & (c > 0.0) & (c < b) & (b < 2.0 + 0.5 * c))
 
 
 def _critical_angles(v: Floats, gains: ControllerParameters, ts: float) -> Floats:

@@ -1,0 +1,64 @@
+"""The reference of a whole run, compiled: that of `agv_cloud.reference`, bit for bit."""
+
+from __future__ import annotations
+
+import functools
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.compiled import compiled
+from agv_analysis.run import Floats
+from agv_cloud.parameters import ErrorDetectorParameters
+from agv_cloud.reference import Reference, lap_steps
+from agv_cloud.tracks import TRACKS
+from agv_plant.unicycle import euler_step
+
+
+def reference_of(detector: ErrorDetectorParameters, steps: int) -> Floats:
+    """A reference track's first steps, shape (steps, 5); kept, since many runs ask for the same. Not to be written to.
+
+    Raises TrackFileError for a bad track file.
+    """
+    return _reference(detector, steps, _edition(detector.track_file))
+
+
+@functools.lru_cache(maxsize=8)
+def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -> Floats:
+    if detector.track not in TRACKS:
+        return Reference(detector).first(steps)
+    points = np.empty((steps, 5))
+    _drive_all(detector.track)(points, detector.track_start, lap_steps(detector), detector.ts, detector.speed)
+    return points
+
+
+def _edition(path: str) -> object:
+    """What changes when a file does; None if there is no such file."""
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+@functools.cache
+def _drive_all(name: str) -> Callable[..., None]:
+    """`drive_all` with a track in it, compiled; a global of it, since what is compiled of a closure cannot be kept."""
+    known = {**globals(), "track": TRACKS[name]}
+    return compiled(types.FunctionType(drive_all.__code__, known, drive_all.__name__))
+
+
+track: Any = TRACKS["line"]
+"""Which `drive_all` is made for; as it stands here, a straight line."""
+
+
+def drive_all(points: Floats, start: tuple[float, float, float], lap: int, ts: float, speed: float) -> None:
+    """Fill in the reference at the steps 0 .. N - 1, shape (N, 5), columns x, y, theta, v, w."""
+    x, y, theta = start
+    for k in range(len(points)):
+        v, w = track(k, lap, ts, speed)
+        points[k, 0], points[k, 1], points[k, 2], points[k, 3], points[k, 4] = x, y, theta, v, w
+        x, y, theta = euler_step(x, y, theta, v, w, ts)
