@@ -203,6 +203,7 @@ def _start(chunk_record: bytes, count: int | None = None) -> bytes:
 # -- cut --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.no_cover
 def test_a_cut_anywhere_leaves_exactly_the_whole_messages(
     truth: Truth, kind: str, read: Callable[[bytes], Bag]
 ) -> None:
@@ -245,6 +246,7 @@ def _flips(truth: Truth, kind: str) -> Iterator[tuple[int, bytes]]:
         yield bit, bytes(data)
 
 
+@pytest.mark.no_cover
 def test_a_flipped_bit_is_never_a_wrong_number_in_silence(
     truth: Truth, kind: str, read: Callable[[bytes], Bag]
 ) -> None:
@@ -263,6 +265,7 @@ def test_a_flipped_bit_is_never_a_wrong_number_in_silence(
             assert "which no CRC covers" in where or "not checked" in where
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", PROVEN)
 def test_every_bit_of_a_chunk_record_head(name: str, read: Callable[[bytes], Bag]) -> None:
     data = write(**OPTIONS[name])

@@ -78,6 +78,7 @@ def test_a_burst_from_the_beginning() -> None:
 # -- bernoulli -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("p", [0.01, 0.3, 0.5, 0.9])
 def test_bernoulli_has_its_loss_rate_and_its_runs(p: float) -> None:
     lost = losses(ChannelParameters(model="bernoulli", p=p), 5, "uplink", STEPS)
@@ -156,6 +157,7 @@ def hidden_chain(c: ChannelParameters) -> tuple[NDArray[np.float64], NDArray[np.
     return P, stationary / stationary.sum(), np.array([1.0 - c.k, 1.0 - c.h])
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("c", GILBERT_ELLIOTT, ids=str)
 def test_gilbert_elliott_has_its_loss_rate(c: ChannelParameters) -> None:
     P, stationary, chance = hidden_chain(c)
@@ -169,6 +171,7 @@ def test_gilbert_elliott_has_its_loss_rate(c: ChannelParameters) -> None:
     assert abs(lost.mean() - rate) < 5.0 * spread
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("c", GILBERT_ELLIOTT, ids=str)
 def test_gilbert_elliott_forgets_with_the_chain_s_second_eigenvalue(c: ChannelParameters) -> None:
     P, stationary, chance = hidden_chain(c)
@@ -180,6 +183,7 @@ def test_gilbert_elliott_forgets_with_the_chain_s_second_eigenvalue(c: ChannelPa
         assert np.mean(lost[:-lag] * lost[lag:]) == pytest.approx(both, abs=5.0 * math.sqrt(both / independent))
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("c", GILBERT_ELLIOTT[:3], ids=str)
 def test_gilbert_s_outages_are_geometric_with_mean_1_over_r(c: ChannelParameters) -> None:
     lost = losses(c, 7, "uplink", STEPS)
@@ -274,6 +278,7 @@ def test_the_same_source_gives_the_same_verdicts(model: str) -> None:
 # -- the downlink's fate shared with the uplink's ---------------------------------------------------------------------
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8, 1.0])
 def test_a_correlated_downlink_has_its_correlation_and_its_own_loss_rate(share: float) -> None:
     p = 0.3

@@ -41,6 +41,7 @@ def changed_topics(first: Path, second: Path) -> dict[str, tuple[int, int]]:
 
 
 # v(0), settling to 1 cm, damping: the canonical scenario's published behaviour, worked out independently of this code.
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("kx", "v_max", "settled", "damping"),
     [
@@ -93,6 +94,7 @@ def naive_loop(lost: np.ndarray, kx: float, ky: float, ktheta: float, ts: float,
     return np.array(states)
 
 
+@pytest.mark.no_cover
 def test_a_lap_with_30_percent_losses_agrees_with_an_independent_loop(drive: Drive) -> None:
     run = drive("relay.uplink.model=bernoulli", "relay.uplink.p=0.3", "relay.seed=5")
     assert len(run) == 20000
@@ -100,6 +102,7 @@ def test_a_lap_with_30_percent_losses_agrees_with_an_independent_loop(drive: Dri
     np.testing.assert_allclose(run.pose, naive_loop(run.lost, 25.0, 1.0, 2.0, 0.005, 20000), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.no_cover
 def test_a_perfect_start_stays_perfect(drive: Drive) -> None:
     run = drive("plant.initial_pose=[0.0, 0.0, 1.5707963267948966]")
     assert len(run) == 20000
@@ -107,6 +110,7 @@ def test_a_perfect_start_stays_perfect(drive: Drive) -> None:
     assert np.abs(run.pose - run.reference[:, :3]).max() < 1e-12
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(("n", "grows"), [(14, False), (16, True)])
 def test_bursts_below_the_border_contract_and_beyond_it_grow(drive: Drive, n: int, grows: bool) -> None:
     """Along a straight line the error goes from burst to burst by a closed form, which no nonlinearity disturbs.

@@ -70,6 +70,7 @@ def test_a_lone_corner_is_a_quarter_of_a_circle() -> None:
     np.testing.assert_array_equal(found[~bend & (found[:, 0] < 2.5), 1], 0.0)
 
 
+@pytest.mark.no_cover
 @given(points, st.floats(0.05, 5.0), st.floats(0.01, 3.0))
 def test_it_obeys_the_plant_s_recursion_and_stays_by_the_lines(
     path: list[tuple[float, float]], speed: float, corner: float

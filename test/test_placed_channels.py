@@ -86,6 +86,7 @@ def test_inside_and_outside_have_their_loss_rates_whatever_was_asked_before() ->
         assert not lost[0]
 
 
+@pytest.mark.no_cover
 def test_an_outage_lasts_as_long_as_the_way_through_the_hole() -> None:
     """At 1 m/s through a circle of 0.5 m and a square of 2 m: 200 and 400 slots; the AGV is where it should be."""
     run = simulate(load_scenario("config/paper.yaml", [
@@ -282,6 +283,7 @@ SCENARIOS: dict[str, Callable[[], list[str]]] = {
 }
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("settings_of", SCENARIOS.values(), ids=SCENARIOS)
 def test_many_runs_are_the_single_ones(settings_of: Callable[[], list[str]]) -> None:
     scenario = load_scenario("config/paper.yaml", [*settings_of(), "plant.duration=10.0", "controller.kx=5.0"])

@@ -35,6 +35,7 @@ seeds = st.integers(0, 2**62)
 questions = st.lists(st.one_of(st.integers(0, 60), st.integers(4090, 4100), st.integers(0, STEPS - 1)), max_size=25)
 
 
+@pytest.mark.no_cover
 @settings(deadline=None, derandomize=True, max_examples=60)
 @given(parameters, seeds, questions)
 def test_verdicts_do_not_depend_on_what_was_asked_before(c: ChannelParameters, seed: int, asked: list[int]) -> None:
@@ -44,6 +45,7 @@ def test_verdicts_do_not_depend_on_what_was_asked_before(c: ChannelParameters, s
         assert channel.lost(k) == verdicts[k]
 
 
+@pytest.mark.no_cover
 @settings(deadline=None, derandomize=True, max_examples=20)
 @given(parameters, seeds)
 def test_each_verdict_alone_is_that_of_the_whole_run(c: ChannelParameters, seed: int) -> None:

@@ -109,6 +109,7 @@ def files(tmp_path: Path) -> tuple[str, str]:
     return f"error_detector.track_file={track}", f"relay.uplink.trace_file={trace}"
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("limit", LIMITED.values(), ids=LIMITED)
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
 @pytest.mark.parametrize("policy", POLICIES)
@@ -129,6 +130,7 @@ def test_every_track(drive: Callable[..., Run], files: tuple[str, str], track: s
     agree(drive(*files, *LOSSY, f"error_detector.track={track}", "plant.duration=1.5"))
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("settings", RUNS.values(), ids=RUNS)
 def test_a_recorded_run_is_the_simulated_one(drive: Callable[..., Run], settings: tuple[str, ...]) -> None:
     agree(drive(*settings, "plant.duration=3.0"))

@@ -84,6 +84,7 @@ def assert_agrees(run: Run, naive: Naive) -> None:
     np.testing.assert_allclose(np.hstack([run.pose, run.command]), expected, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("v_max", [math.inf, 6.0])
 @pytest.mark.parametrize("integration", ["euler", "arc"])
 def test_a_lap_with_a_third_of_the_poses_lost(v_max: float, integration: str) -> None:

@@ -28,6 +28,7 @@ def ages(lost: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(found)
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "channel",
     [

@@ -81,6 +81,7 @@ def test_simulated_twins_on_both_sides_of_each_border(settings: tuple[str, ...],
     assert found.contracting == (20 if contracts else 0)
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(("settings", "contracts"), BORDERS)
 def test_recorded_twins_on_both_sides_of_each_border(
     drive: Drive, tmp_path: Path, settings: tuple[str, ...], contracts: bool

@@ -42,6 +42,7 @@ def test_the_fit_finds_the_channel_that_made_the_losses(p: float, r: float) -> N
     assert missed <= 8
 
 
+@pytest.mark.no_cover
 def test_independent_losses_are_seldom_called_bursty() -> None:
     """At a significance of 1 %, 8 or more false alarms in 200 have probability 0.001."""
     channel = ChannelParameters(model="bernoulli", p=0.3)

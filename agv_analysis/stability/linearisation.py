@@ -30,8 +30,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
+from agv_analysis.stability.products import multiply
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
@@ -127,18 +129,32 @@ def reception_maps(F: Floats, G: Floats, received: NDArray[np.int64], end: int, 
     `received` holds the steps of the receptions, increasing; steps beyond the rows of F and G, shape (N, m, m), are
     those of further laps. H as of `burst_maps`.
     """
-    lengths = np.diff(np.append(received, end))
-    maps = np.broadcast_to(np.eye(F.shape[-1]), (len(received), *F.shape[1:])).copy()
-    at_edge = maps.copy()
-    for i in range(int(lengths.max())):
-        going = np.flatnonzero(lengths > i)
-        now = (received[going] + i) % len(F)
-        if H is None:
-            maps[going] = F[now] @ maps[going] + G[now]
-        else:
-            maps[going] = F[now] @ maps[going] + G[now] @ at_edge[going]
-            at_edge[going] = H[now] @ at_edge[going]
-    return np.asarray(maps)
+    maps = np.empty((len(received), *F.shape[1:]))
+    F, G, H = (np.ascontiguousarray(M) for M in (F, G, F[:0] if H is None else H))
+    compiled(_fill_in_maps)(F, G, H, received, np.diff(np.append(received, end)), maps)
+    return maps
+
+
+def _fill_in_maps(
+    F: Floats, G: Floats, H: Floats, received: NDArray[np.int64], lengths: NDArray[np.int64], maps: Floats
+) -> None:
+    """`maps` of `reception_maps`; H has no row where it is the identity."""
+    size = F.shape[1]
+    M, at_edge, product = np.empty((size, size)), np.empty((size, size)), np.empty((size, size))
+    for r in range(len(received)):
+        M[:], at_edge[:] = np.eye(size), np.eye(size)
+        for i in range(lengths[r]):
+            k = (received[r] + i) % len(F)
+            if len(H) == 0:
+                product[:] = G[k]
+            else:
+                multiply(G[k], at_edge, False, product, False)
+            multiply(F[k], M, False, product, True)
+            M[:] = product
+            if len(H) != 0:
+                multiply(H[k], at_edge, False, product, False)
+                at_edge[:] = product
+        maps[r] = M
 
 
 def loop_jacobians(

@@ -10,11 +10,12 @@ import numpy as np
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability import almost_sure, both_links, bursts, floquet, lifted, mean_square, paper
 from agv_analysis.stability.chain import chain_of
 from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference, lap_steps
+from agv_cloud.reference import lap_steps
 from agv_plant.parameters import ChannelParameters, PlantParameters
 from agv_ros.parameters import SHARED, as_dict
 
@@ -136,7 +137,7 @@ def margins(scenario: Scenario) -> Margins:
     not stabilise it.
     """
     ts, gains, reasons = scenario.plant.ts, scenario.controller, {}
-    reference = Reference(scenario.error_detector).first(_lap(scenario))
+    reference = reference_of(scenario.error_detector, _lap(scenario))
     theta, v_r, w_r = reference[:, 2], reference[:, 3], reference[:, 4]
     n_paper = paper.largest_n(theta, v_r, gains, ts)
     if n_paper is None:

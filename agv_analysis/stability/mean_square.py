@@ -16,6 +16,7 @@ length B at a loss rate pi: pi B < 1/a - 1/2.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.chain import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.stability.linearisation import HELD, MARGINAL, Edge, is_constant, reachable, seen, step_matrices
+from agv_analysis.stability.products import multiply
 from agv_cloud.parameters import ControllerParameters
 
 _LAPS = 40
@@ -124,22 +126,22 @@ def _drive_lap(F: Floats, G: Floats, H: Floats, T: Floats, g: Floats, moments: F
         M[:] = F[k] + G[k]
         for i in range(states):
             ee, eh, hh = moments[0, i], moments[1, i], moments[2, i]
-            _multiply(M, ee, False, received[1, i], False)
-            _multiply(received[1, i], M, True, received[0, i], False)
+            multiply(M, ee, False, received[1, i], False)
+            multiply(received[1, i], M, True, received[0, i], False)
             received[2, i] = ee
-            _multiply(F[k], eh, False, missed[1, i], False)
-            _multiply(G[k], hh, False, missed[1, i], True)
-            _multiply(F[k], ee, False, upper, False)
-            _multiply(G[k], eh, True, upper, True)
-            _multiply(upper, F[k], True, missed[0, i], False)
-            _multiply(missed[1, i], G[k], True, missed[0, i], True)
+            multiply(F[k], eh, False, missed[1, i], False)
+            multiply(G[k], hh, False, missed[1, i], True)
+            multiply(F[k], ee, False, upper, False)
+            multiply(G[k], eh, True, upper, True)
+            multiply(upper, F[k], True, missed[0, i], False)
+            multiply(missed[1, i], G[k], True, missed[0, i], True)
             missed[2, i] = hh
             if len(H):
                 for which in (received, missed):
-                    _multiply(which[1, i], H[k], True, upper, False)
+                    multiply(which[1, i], H[k], True, upper, False)
                     which[1, i] = upper
-                    _multiply(which[2, i], H[k], True, upper, False)
-                    _multiply(H[k], upper, False, which[2, i], False)
+                    multiply(which[2, i], H[k], True, upper, False)
+                    multiply(H[k], upper, False, which[2, i], False)
         largest = 0.0
         for j in range(states):
             _mix(T[:, j], g, received, missed, moments[:, j])
@@ -167,17 +169,6 @@ def _mix(weights: Floats, g: Floats, received: Floats, missed: Floats, mixed: Fl
                 mixed[which, p, q] = value
 
 
-def _multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool) -> None:
-    """`product` = A B, or A B' if `transposed`; added to what is there if `add`. All of shape (m, m)."""
-    size = A.shape[0]
-    for i in range(size):
-        for j in range(size):
-            value = product[i, j] if add else 0.0
-            for m in range(size):
-                value += A[i, m] * (B[j, m] if transposed else B[m, j])
-            product[i, j] = value
-
-
 def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD) -> float:
     """Loss probability p* below which independent losses leave a lap mean-square stable; -1: unstable without any.
 
@@ -185,6 +176,7 @@ def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: flo
     """
     moments = unit_moments(1)
 
+    @functools.cache  # the ends of an interval are asked for again
     def growth(p: float) -> float:
         return lap_growth(v_r, w_r, gains, ts, bernoulli(p), moments, edge) - MARGINAL * len(v_r)
 
@@ -208,6 +200,7 @@ def critical_burst(
     """
     moments = unit_moments(2)
 
+    @functools.cache
     def growth(burst: float) -> float:
         return lap_growth(v_r, w_r, gains, ts, bursty(loss_rate, burst), moments, edge) - MARGINAL * len(v_r)
 

@@ -72,11 +72,7 @@ def _orthogonalised_pass(factors: Floats, basis: Floats, logs: Floats) -> None:
     size = basis.shape[0]
     image = np.empty((size, size))
     for k in range(factors.shape[0]):
-        for i in range(size):
-            for j in range(size):
-                image[i, j] = 0.0
-                for m in range(size):
-                    image[i, j] += factors[k, i, m] * basis[m, j]
+        multiply(factors[k], basis, False, image, False)
         for j in range(size):
             for before in range(j):
                 dot = 0.0
@@ -91,3 +87,17 @@ def _orthogonalised_pass(factors: Floats, basis: Floats, logs: Floats) -> None:
             logs[j] += math.log(length) if length > 0.0 else -math.inf
             for i in range(size):
                 basis[i, j] = image[i, j] / length if length > 0.0 else 0.0
+
+
+def multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool) -> None:
+    """`product` = A B, or A B' if `transposed`; added to what is there if `add`. All of shape (m, m).
+
+    Written to be compiled into its callers, where numpy's own costs more than the product.
+    """
+    size = A.shape[0]
+    for i in range(size):
+        for j in range(size):
+            value = product[i, j] if add else 0.0
+            for m in range(size):
+                value += A[i, m] * (B[j, m] if transposed else B[m, j])
+            product[i, j] = value
