@@ -281,7 +281,7 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
     def shown() -> dict[str, str]:
         cells = "[...row.cells].map(cell => cell.innerText)"
         rows = page.chrome.execute_script(f"return [...document.querySelectorAll('#lap tr')].map(row => {cells})")
-        return {name: value for name, value, _ in rows}
+        return dict(rows)
 
     before, after = expected(25.0), expected(28.0)
 

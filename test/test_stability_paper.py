@@ -117,6 +117,17 @@ def test_a_short_lap_against_every_n(lap: Lap, track: str, kx: float) -> None:
 
 
 @settings(deadline=None, derandomize=True, max_examples=200)
+@given(st.lists(st.floats(-2.0, 2.0), min_size=1, max_size=25), st.lists(st.floats(0.1, 3.0), min_size=25, max_size=25))
+def test_any_headings_against_every_n(headings: list[float], speeds: list[float]) -> None:
+    theta, v, by = np.array(headings), np.array(speeds[: len(headings)]), ControllerParameters(kx=150.0)
+    later, earlier = np.tril_indices(len(theta))
+    radii = np.abs(np.linalg.eigvals(matrices(theta[later], theta[earlier], v[earlier], by, TS))).max(axis=1)
+    assume(np.all(np.abs(radii - 1.0) > 1e-9))  # nearer, numpy's rounding decides
+    gaps = (later - earlier)[radii > 1.0]
+    assert largest_n(theta, v, by, TS) == (gaps.min() - 1 if len(gaps) else None)
+
+
+@settings(deadline=None, derandomize=True, max_examples=200)
 @given(st.floats(0.1, 900.0), st.floats(0.01, 3e4), st.floats(0.1, 900.0), speed)
 def test_it_fails_at_once_where_an_eigenvalue_of_a_fresh_pose_is_outside(
     kx: float, ky: float, ktheta: float, v: float

@@ -28,9 +28,6 @@ _MOST_DOTS = 100
 _PLACES = 100
 """Places of the track at which the lifted system is asked: all of them would take longer than the lap."""
 
-_kept = functools.lru_cache(maxsize=4)(simulate)
-"""The pinned run does not change while another setting is moved."""
-
 
 class Answer(NamedTuple):
     """What the page shows."""
@@ -44,16 +41,23 @@ class Answer(NamedTuple):
 def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
     """Simulate a scenario and, beside it, a pinned one that meets the same outages. Raises UserError as `simulate`."""
     run = simulate(scenario)
-    other = None if pinned is None else _kept(under_the_outages_of(pinned, scenario))
+    other, values_of_other = (None, None) if pinned is None else _kept(under_the_outages_of(pinned, scenario))
     first = beside(track(run), None if other is None else track(other))
     over_time = [beside(panel(run), None if other is None else panel(other)) for panel in (distance, speed, age)]
     values = list(told(run))
-    others = [""] * len(values) if other is None else [value for _, value in told(other)]
+    others = values_of_other or [""] * len(values)
     return Answer(
         track=figure([first], _MOST_POINTS, dots=_MOST_DOTS),
         time=figure(over_time, _MOST_POINTS),
         rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
     )
+
+
+@functools.lru_cache(maxsize=4)
+def _kept(scenario: Scenario) -> tuple[Run, list[str]]:
+    """A run and the values that it tells: those of a pinned setting do not change while another one is moved."""
+    run = simulate(scenario)
+    return run, [value for _, value in told(run)]
 
 
 def under_the_outages_of(pinned: Scenario, scenario: Scenario) -> Scenario:
@@ -85,7 +89,7 @@ def told(run: Run) -> Iterator[tuple[str, str]]:
     if predicts:
         yield "Pose always that old", "predicted: with an exact model as without outages"
     else:
-        some = np.linspace(0, len(v) - 1, _PLACES).astype(np.int64)
+        some = np.arange(0, len(v), max(1, len(v) // _PLACES))  # quarters of a lap that are alike stay so
         radius = lifted.largest_radius(n, v[some], w[some], gains, ts)
         yield "Pose always that old", f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
     top = float(np.abs(v).max())

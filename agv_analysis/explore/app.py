@@ -173,7 +173,10 @@ def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
 
 
 def _table(html: Any, rows: list[tuple[str, str, str]]) -> list[Any]:
-    return [html.Tr([html.Th(name), html.Td(value), html.Td(other)]) for name, value, other in rows]
+    """Rows with a third cell only where there is something in it: each cell is felt at every move."""
+    return [
+        html.Tr([html.Th(name), *(html.Td(cell) for cell in (value, other) if cell)]) for name, value, other in rows
+    ]
 
 
 def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_cloud.parameters import ControllerParameters
 
@@ -74,24 +75,46 @@ def largest_n(theta: Floats, v_r: Floats, gains: ControllerParameters, ts: float
     Heading theta [rad] and speed v_r [m/s] of the reference, shape (N,); for k < n the edge holds X_c(0). -1 if it
     fails even without outages, None if it holds for every n up to the lap's end.
 
-    For a pose held at step j the test fails from the step k on at which |theta(k) - theta(j)| first reaches a critical
-    angle. That some pair at most n steps apart fails is monotone in n, and seen from sliding extremes of the heading.
+    For a pose held at step j the test fails at the steps k at which |theta(k) - theta(j)| is at least a critical angle.
     """
     if not np.all(_holds_without_outages(v_r, gains, ts)):
         return -1
-    critical = _critical_angles(v_r, gains, ts)
+    found = int(compiled(_widest)(np.ascontiguousarray(theta), _critical_angles(v_r, gains, ts)))
+    return None if found == len(theta) else found
 
-    def fails(n: int) -> bool:
-        highest, lowest = _extremes_ahead(theta, n)
-        return bool(np.any((highest - theta >= critical) | (theta - lowest >= critical)))
 
-    holds, broken = 0, len(theta) - 1
-    if not fails(broken):
-        return None
-    while broken - holds > 1:
-        middle = (holds + broken) // 2
-        holds, broken = (holds, middle) if fails(middle) else (middle, broken)
-    return holds
+def _widest(theta: Floats, critical: Floats) -> int:
+    """Largest n for which no heading is a critical angle away from one at most n steps before; N if none ever is.
+
+    In one pass, over a window that shrinks at each pair that fails. What of the steps before decides, the least
+    theta + critical and the largest theta - critical in the window, is kept in two queues (Lemire, Streaming
+    maximum-minimum filter, 2006).
+    """
+    above, below = theta + critical, theta - critical
+    least, largest = np.empty(len(theta), np.int64), np.empty(len(theta), np.int64)
+    least_from = least_to = largest_from = largest_to = 0
+    n, first = len(theta), 0
+    for k in range(len(theta)):
+        while least_to > least_from and above[least[least_to - 1]] >= above[k]:
+            least_to -= 1
+        while largest_to > largest_from and below[largest[largest_to - 1]] <= below[k]:
+            largest_to -= 1
+        least[least_to] = largest[largest_to] = k
+        least_to, largest_to = least_to + 1, largest_to + 1
+        first = max(first, k - n)
+        while True:
+            while least_from < least_to and least[least_from] < first:
+                least_from += 1
+            while largest_from < largest_to and largest[largest_from] < first:
+                largest_from += 1
+            if least_from < least_to and theta[k] >= above[least[least_from]]:
+                first = least[least_from] + 1
+            elif largest_from < largest_to and theta[k] <= below[largest[largest_from]]:
+                first = largest[largest_from] + 1
+            else:
+                break
+            n = k - first
+    return n
 
 
 def _holds_without_outages(v: Floats, gains: ControllerParameters, ts: float) -> NDArray[np.bool_]:
@@ -117,17 +140,6 @@ def _critical_angles(v: Floats, gains: ControllerParameters, ts: float) -> Float
         cosines = np.vstack((pairs, (8.0 - 4.0 * b - d) / (4.0 * a - 2.0 * s)))
     nearest = np.where(np.abs(cosines) <= 1.0, cosines, -2.0).max(axis=0)
     return np.where(nearest >= -1.0, np.arccos(np.maximum(nearest, -1.0)), np.inf)
-
-
-def _extremes_ahead(theta: Floats, n: int) -> tuple[Floats, Floats]:
-    """Largest and smallest of theta(k) .. theta(k + n), shape (N,); fewer at the end."""
-    highest, lowest, width = theta.copy(), theta.copy(), 1
-    while width <= n:
-        shift = min(width, n + 1 - width)
-        highest[:-shift] = np.maximum(highest[:-shift], highest[shift:])
-        lowest[:-shift] = np.minimum(lowest[:-shift], lowest[shift:])
-        width += shift
-    return highest, lowest
 
 
 def _largest_distance_from_one(t: Floats, s: Floats, d: Floats) -> Floats:
