@@ -42,6 +42,16 @@ def compiled(function: types.FunctionType) -> Callable[..., Any]:
         return _compile(function, _cache_folder(function))
 
 
+@functools.cache
+def compiled_with(function: types.FunctionType, **called: types.FunctionType) -> Callable[..., Any]:
+    """`function` compiled with functions of one's choice in place of its globals of these names.
+
+    Not enclosed by it, since what is compiled of a closure cannot be kept.
+    """
+    known = {**function.__globals__, **called}
+    return compiled(types.FunctionType(function.__code__, known, function.__name__))
+
+
 def numbers(array: Any) -> Any:
     """An array as a compiled function takes it; as lists of plain numbers, which are faster, where nothing is compiled.
 

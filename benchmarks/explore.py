@@ -2,8 +2,8 @@
 
 The peer is what a person bears: an answer within 0.2 s is one to the hand that moves the slider. It is measured in the
 server alone, and, where Chromium is installed, in the browser from the key that moves the slider to the frame that
-shows both plots and the table anew: while a slider is moved on and on, and after rests, in which the criteria for the
-whole lap have begun to be computed beside it.
+shows both plots and the table anew: while a slider is moved on and on, and while the criteria for the whole lap are
+computed beside it, as they are once it has rested for a moment.
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from benchmarks.comparison import Comparison
 CONFIG = str(Path(__file__).parent.parent / "config" / "outages.yaml")
 AT_ONCE = 0.2
 """[s]"""
-LAP_BEGINS = 0.5
-"""Rest [s] after which the criteria for the lap are being computed."""
 
 
 def measure() -> list[Comparison]:
@@ -76,7 +74,7 @@ def in_the_browser() -> list[Comparison]:
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as served:
         assert served.stdout is not None
         try:
-            moves = sorted(_moves(browser, driver, served.stdout.readline().split()[1]))
+            moves = sorted(_moves(browser, driver, served.stdout.readline().split()[1], served.pid))
         finally:
             served.terminate()
     return [
@@ -85,8 +83,8 @@ def in_the_browser() -> list[Comparison]:
     ]
 
 
-def _moves(browser: str, driver: str, address: str) -> list[float]:
-    """How long twenty moves of a slider take [s]."""
+def _moves(browser: str, driver: str, address: str, served: int) -> list[float]:
+    """How long twenty moves of a slider take [s] on a page of process `served`, the last ten beside its criteria."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
     from selenium.webdriver.common.keys import Keys
@@ -102,11 +100,22 @@ def _moves(browser: str, driver: str, address: str) -> list[float]:
         shown = "return document.querySelectorAll('#told tr, #lap tr').length > 12"  # both tables, so all is compiled
         WebDriverWait(chrome, 120.0).until(lambda _: chrome.execute_script(shown))
         handle, found = chrome.find_element("css selector", "#kx [role=slider]"), []
-        for rest in (*[0.0] * 10, *[LAP_BEGINS] * 10):
-            time.sleep(rest)
+        for is_beside in (*[False] * 10, *[True] * 10):
+            if is_beside:
+                WebDriverWait(chrome, 120.0, 0.01).until(lambda _: is_computing_beside(served))
             chrome.execute_script(WATCH)
             handle.send_keys(Keys.ARROW_RIGHT)
             found.append(1e-3 * chrome.execute_async_script("window.moved.then(arguments[0])"))
         return found
     finally:
         chrome.quit()
+
+
+def is_computing_beside(served: int) -> bool:
+    """Does a process that the server has begun hold a core at this moment? By Linux' /proc."""
+    try:
+        begun = " ".join(thread.read_text() for thread in Path(f"/proc/{served}/task").glob("*/children")).split()
+        states = [Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[0] for child in begun]
+    except OSError:  # a thread of the server went meanwhile
+        return False
+    return "R" in states

@@ -589,7 +589,7 @@ def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Sta
     from agv_analysis.recording import read_run
 
     params = tmp_path / "params.yaml"
-    params.write_text("plant: {ros__parameters: {duration: 5.0, answer_timeout: 60.0}}")
+    params.write_text("plant: {ros__parameters: {duration: 10.0, answer_timeout: 60.0}}")
     arguments = ["--ros-args", "--params-file", str(params), "-p", "wait_for_subscribers:=2"]
     bag = ["-p", f"bag:={tmp_path / 'bag'}", "-p", f"params_file:={params}", "-p", "stop_timeout:=30.0"]
     recorder = start("agv_analysis.recorder_node", *arguments, *bag, "-p", "log_time:=stamp")
@@ -607,7 +607,7 @@ def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Sta
         assert (status, "Traceback" in said) == (0, False)
     assert f"started again: {name}" in said
     run = read_run(tmp_path / "bag")
-    assert len(run) == 1000
+    assert len(run) == 2000
     assert abs(run.reference[-1, 1] - run.pose[-1, 1]) < 0.01
     assert [note for note in run.notes if note.startswith(f"{name} was started again")]
     assert not [note for note in run.notes if "was started again" in note and not note.startswith(name)]

@@ -19,9 +19,9 @@ from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
 from agv_analysis.run import Run
+from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 from agv_analysis.version import version
-from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 
 _FEW = 2000
@@ -192,7 +192,7 @@ def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
 
 def _drives_its_track(run: Run) -> bool:
     """Is the run's reference that of the track which its parameters name? A recorded one need not be."""
-    expected = Reference(run.scenario.error_detector).first(int(run.k[-1]) + 1)[run.k]
+    expected = reference_of(run.scenario.error_detector, int(run.k[-1]) + 1)[run.k]
     return bool(np.allclose(run.reference[:, :2], expected[:, :2], rtol=0.0, atol=1e-6))
 
 

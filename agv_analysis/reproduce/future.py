@@ -20,8 +20,9 @@ from agv_analysis.reproduce.report import Table
 from agv_analysis.reproduce.runs import GAINS, gain, scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.batch import cores
+from agv_analysis.simulation.reference import reference_of
+from agv_analysis.simulation.single import steps_of
 from agv_analysis.stability import bursts, lifted, mean_square, paper
-from agv_cloud.reference import Reference
 
 TO_1_CM = "to 1 cm [steps]"
 SHARE_OF_K_THETA = "K_y / K_theta^2"
@@ -193,7 +194,7 @@ def _criteria() -> list[Values]:
 def _criteria_at(track: str, kx: float) -> Values:
     settings = (*gain(kx), ON_TRACK, f"error_detector.track={track}")
     wanted, burst = scenario(*settings), (*settings, "relay.uplink.model=burst")
-    reference = Reference(wanted.error_detector).first(round(wanted.plant.duration / wanted.plant.ts))
+    reference = reference_of(wanted.error_detector, steps_of(wanted))
     theta, v_r, w_r = reference[:, 2], reference[:, 3], reference[:, 4]
     gains, ts = wanted.controller, wanted.plant.ts
     n_paper = paper.largest_n(theta, v_r, gains, ts)

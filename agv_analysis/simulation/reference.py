@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import functools
-import types
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled import compiled_with
 from agv_analysis.run import Floats
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference, lap_steps
@@ -31,7 +29,8 @@ def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -
     if detector.track not in TRACKS:
         return Reference(detector).first(steps)
     points = np.empty((steps, 5))
-    _drive_all(detector.track)(points, detector.track_start, lap_steps(detector), detector.ts, detector.speed)
+    drive = compiled_with(drive_all, track=TRACKS[detector.track])
+    drive(points, detector.track_start, lap_steps(detector), detector.ts, detector.speed)
     return points
 
 
@@ -42,13 +41,6 @@ def _edition(path: str) -> object:
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size
-
-
-@functools.cache
-def _drive_all(name: str) -> Callable[..., None]:
-    """`drive_all` with a track in it, compiled; a global of it, since what is compiled of a closure cannot be kept."""
-    known = {**globals(), "track": TRACKS[name]}
-    return compiled(types.FunctionType(drive_all.__code__, known, drive_all.__name__))
 
 
 track: Any = TRACKS["line"]

@@ -9,15 +9,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import types
 from collections import namedtuple
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled import compiled, compiled_with, numbers
 from agv_analysis.simulation.chance import normals
 from agv_analysis.simulation.on_air import Way
 from agv_plant.channel_setup import Segment, floor_of, levels_of, segments_of
@@ -110,10 +108,11 @@ class Air:
 
     def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts, states: States) -> None:
         """Ask the channel's model, slot by slot."""
+        judge = compiled_with(judge_all, model=find_model(channel.model))
         random, state = numbers(self._draws(channel, stream)), GOOD
         for segment, end in _segments(channel, self._steps, self._ts):
             parameters = _Numbers(*(getattr(segment.channel, name) for name in _NUMERIC))
-            state = _judge_all(channel.model)(parameters, random, lost, states, segment.first, end, state)
+            state = judge(parameters, random, lost, states, segment.first, end, state)
 
     def _draws(self, channel: ChannelParameters, stream: str) -> NDArray[np.float64]:
         if channel.correlation == 0.0:
@@ -159,16 +158,6 @@ def _one_by_one(channel: Channel, states: States) -> Verdicts:
         verdict = channel.judge(k)
         lost[k], states[k] = verdict.lost, verdict.state
     return lost
-
-
-@functools.cache
-def _judge_all(name: str) -> Callable[..., int]:
-    """`judge_all` with a channel's model in it, compiled.
-
-    The model is a global of the function and not enclosed by it, since what is compiled of a closure cannot be kept.
-    """
-    known = {**globals(), "model": find_model(name)}
-    return compiled(types.FunctionType(judge_all.__code__, known, judge_all.__name__))
 
 
 model: Any = MODELS["perfect"]
