@@ -26,7 +26,7 @@ from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version
 from agv_ros.executor import run_node
 from agv_ros.node import ENDED, LoopNode
-from agv_ros.wire import PUBLISHED, stamp_of
+from agv_ros.codec import PUBLISHED, stamp_of
 
 TOPICS: dict[str, type] = {
     "/clock": Clock,

@@ -21,7 +21,7 @@ from agv_cloud.parameters import PATH
 from agv_cloud.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S, Grid
-from agv_ros.wire import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_quaternion
+from agv_ros.codec import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_quaternion
 
 Steps = NDArray[np.int64]
 

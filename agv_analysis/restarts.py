@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_ros.stamps import NS_PER_S, Grid
-from agv_ros.wire import PUBLISHED
+from agv_ros.codec import PUBLISHED
 
 TOPIC = "/diagnostics"
 

@@ -31,7 +31,7 @@ from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals
 from agv_ros.node import LoopNode, overrides
 from agv_ros.parameters import LoopParameters
-from agv_ros.wire import Command, TrackingError
+from agv_ros.codec import Command, TrackingError
 
 N = TypeVar("N", bound=LoopNode[Any])
 R = TypeVar("R", bound=RecorderNode)

@@ -28,11 +28,11 @@ from agv_plant.unicycle import STEPS
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY
 from agv_ros.node import LoopNode
-from agv_ros.slot_join import Joined, SlotJoin
-from agv_ros.speeds_wire import SpeedsAhead, encode_speeds
+from agv_ros.message_sync import Joined, SlotJoin
+from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
 from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
 from agv_ros.transforms import TransformBroadcaster
-from agv_ros.wire import (
+from agv_ros.codec import (
     FRAME_MAP,
     FRAME_REFERENCE,
     InvalidMessageError,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agv_ros.wire import Command
+from agv_ros.codec import Command
 
 
 class HeldCommand:

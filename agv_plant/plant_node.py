@@ -27,11 +27,11 @@ from agv_plant.random_stream import normals_of
 from agv_plant.unicycle import State
 from agv_ros.executor import run_node
 from agv_ros.node import LoopNode
-from agv_ros.slot_join import Joined, SlotJoin
-from agv_ros.speeds_wire import decode_speeds
+from agv_ros.message_sync import Joined, SlotJoin
+from agv_ros.speeds_codec import decode_speeds
 from agv_ros.stamps import to_nanoseconds
 from agv_ros.transforms import TransformBroadcaster
-from agv_ros.wire import (
+from agv_ros.codec import (
     FRAME_AGV,
     Command,
     InvalidMessageError,

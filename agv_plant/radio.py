@@ -24,7 +24,7 @@ from agv_plant.parameters import ChannelParameters
 from agv_plant.random_stream import InBlocks, uniforms
 from agv_ros.parameters import LoopParameters
 from agv_ros.stamps import Grid, NearestSteps, Steps
-from agv_ros.wire import DELAYED, DELIVERED, LOST, Slot
+from agv_ros.codec import DELAYED, DELIVERED, LOST, Slot
 
 _BLOCK = 4096
 

@@ -19,7 +19,7 @@ from agv_plant.radio import Channel, Link, Passage
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST
 from agv_ros.node import LoopNode, Output
-from agv_ros.wire import (
+from agv_ros.codec import (
     InvalidMessageError,
     decode_command,
     decode_odometry,

@@ -31,7 +31,7 @@ from rclpy.signals import SignalHandlerOptions
 from agv_ros.errors import UserError
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid, to_nanoseconds
-from agv_ros.wire import PUBLISHED, InvalidMessageError, encode_diagnostics, stamp_of
+from agv_ros.codec import PUBLISHED, InvalidMessageError, encode_diagnostics, stamp_of
 
 P = TypeVar("P", bound=LoopParameters)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from agv_ros.wire import Pose, encode_transform
+from agv_ros.codec import Pose, encode_transform
 
 if TYPE_CHECKING:
     from agv_ros.node import LoopNode

@@ -25,7 +25,7 @@ from agv_plant.channels.delay import EXPIRED, delay_in_slots, whole_slots
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio import Channel, Link, losses
 from agv_ros.stamps import Grid
-from agv_ros.wire import DELAYED, DELIVERED, LOST, facts_in
+from agv_ros.codec import DELAYED, DELIVERED, LOST, facts_in
 from test.test_links import last_words
 
 if TYPE_CHECKING:

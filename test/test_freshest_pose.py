@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_cloud.freshest_pose import BELIEVED_NS, IN_A_ROW, WINDOW_NS, FreshestPose
-from agv_ros.wire import Pose
+from agv_ros.codec import Pose
 
 MS = 1_000_000
 TS = 5 * MS

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_plant.held_command import HeldCommand
-from agv_ros.wire import Command
+from agv_ros.codec import Command
 
 TIMEOUT = 100
 

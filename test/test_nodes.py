@@ -32,7 +32,7 @@ from agv_plant.unicycle import arc_step
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS, LoopNode
-from agv_ros.speeds_wire import SpeedsAhead, encode_speeds
+from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
 
 if TYPE_CHECKING:
     from test.conftest import Start

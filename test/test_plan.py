@@ -18,8 +18,8 @@ from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import BUFFER, share_of_command
 from agv_plant.unicycle import STEPS
 from agv_ros.parameters import ParameterError
-from agv_ros.speeds_wire import SpeedsAhead, decode_speeds, encode_speeds
-from agv_ros.wire import InvalidMessageError
+from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
+from agv_ros.codec import InvalidMessageError
 
 PAPER = str(Path(__file__).parents[1] / "config" / "paper.yaml")
 

@@ -28,7 +28,7 @@ from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_cloud.reference import Reference
 from agv_ros.transforms import TOPIC
-from agv_ros.wire import Pose, decode_odometry, decode_pose, encode_transform
+from agv_ros.codec import Pose, decode_odometry, decode_pose, encode_transform
 
 REPOSITORY = Path(__file__).parents[1]
 STORE = get_typestore(Stores.ROS2_JAZZY)

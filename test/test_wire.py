@@ -18,7 +18,7 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from agv_ros.wire import (
+from agv_ros.codec import (
     DELIVERED,
     LOST,
     Command,

@@ -11,7 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from agv_ros.stamps import NS_PER_S
-from agv_ros.wire import InvalidMessageError, stamp_of
+from agv_ros.codec import InvalidMessageError, stamp_of
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 _HEADER = len(_ENCAPSULATION)
