@@ -23,7 +23,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.stability.empirical import distances
-from agv_plant.channels.installed import SHARED
+from agv_plant.channels.registry import SHARED
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
 from agv_ros.parameters import ParameterError

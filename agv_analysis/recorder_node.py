@@ -24,9 +24,9 @@ from agv_analysis.message_schema import schema_of
 from agv_analysis.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version
+from agv_ros.codec import PUBLISHED, stamp_of
 from agv_ros.executor import run_node
 from agv_ros.node import ENDED, LoopNode
-from agv_ros.codec import PUBLISHED, stamp_of
 
 TOPICS: dict[str, type] = {
     "/clock": Clock,

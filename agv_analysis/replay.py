@@ -27,10 +27,10 @@ from agv_analysis.simulation.single import settings_of
 from agv_cloud.parameters import PATH
 from agv_cloud.reference import Reference, ReferencePoint
 from agv_cloud.staleness import Posture, Prediction
-from agv_plant.unicycle import STEPS
+from agv_plant.vehicle.unicycle import STEPS
+from agv_ros.codec import Command, InvalidMessageError, TrackingError, decode_slot, stamp_of
 from agv_ros.errors import UserError
 from agv_ros.stamps import Grid, OffGridError
-from agv_ros.codec import Command, InvalidMessageError, TrackingError, decode_slot, stamp_of
 
 TOLERANCE = 1e-9
 """Largest difference that is none, as a share of the recorded value where that is above 1."""

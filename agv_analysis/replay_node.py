@@ -16,9 +16,9 @@ from sensor_msgs.msg import TimeReference
 from agv_analysis.bag_writer import REPLAY_OF
 from agv_analysis.recorder_node import TOPICS, RecorderNode
 from agv_analysis.replay import EdgeInputs, Input
+from agv_ros.codec import Command, TrackingError, decode_command, decode_error, encode_clock
 from agv_ros.node import LOOP_QOS, LoopNode
 from agv_ros.parameters import LoopParameters
-from agv_ros.codec import Command, TrackingError, decode_command, decode_error, encode_clock
 
 _PATIENCE = 10.0
 """How long [s] the edge may take for an answer, before it is given up."""

@@ -12,11 +12,11 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.plan import planned_commands
+from agv_ros.codec import FRAME_AGV, Command, TrackingError, decode_error, encode_command, encode_twist
 from agv_ros.executor import run_node
 from agv_ros.message_types import TWIST_STAMPED
 from agv_ros.node import LoopNode
 from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
-from agv_ros.codec import FRAME_AGV, Command, TrackingError, decode_error, encode_command, encode_twist
 
 _MOST_WAITING = 1000
 """Errors and horizons that wait for each other at most."""

@@ -24,14 +24,7 @@ from agv_cloud.reference import Reference, ReferencePoint
 from agv_cloud.reference_path import path_points, thinned
 from agv_cloud.staleness import Posture, Prediction
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.unicycle import STEPS
-from agv_ros.executor import run_node
-from agv_ros.message_types import ODOMETRY
-from agv_ros.node import LoopNode
-from agv_ros.message_sync import Joined, SlotJoin
-from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
-from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
-from agv_ros.transforms import TransformBroadcaster
+from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.codec import (
     FRAME_MAP,
     FRAME_REFERENCE,
@@ -49,6 +42,13 @@ from agv_ros.codec import (
     quaternion_of_yaw,
     stamp_of,
 )
+from agv_ros.executor import run_node
+from agv_ros.message_sync import Joined, SlotJoin
+from agv_ros.message_types import ODOMETRY
+from agv_ros.node import LoopNode
+from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
+from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
+from agv_ros.transforms import TransformBroadcaster
 
 TIMER = "timer"
 """What edge/age says of its slots, in place of a verdict."""

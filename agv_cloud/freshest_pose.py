@@ -13,8 +13,8 @@ No clock, no thread, no ROS in here: poses and instants go in.
 
 from __future__ import annotations
 
-from agv_ros.stamps import NS_PER_S
 from agv_ros.codec import Pose
+from agv_ros.stamps import NS_PER_S
 
 WINDOW_NS = 10 * NS_PER_S
 """Least offsets are taken over this time and the one before it."""

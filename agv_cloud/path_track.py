@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from agv_cloud.reference import ReferencePoint
-from agv_plant.unicycle import arc_step
+from agv_plant.vehicle.unicycle import arc_step
 
 Point = tuple[float, float]
 

@@ -15,8 +15,8 @@ from collections.abc import Iterable
 
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.motion import plant_step
-from agv_plant.unicycle import euler_step
+from agv_plant.vehicle.motion import plant_step
+from agv_plant.vehicle.unicycle import euler_step
 
 
 def next_error(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from agv_cloud.parameters import CSV, PATH, ErrorDetectorParameters
 from agv_cloud.track_file import load_track
 from agv_cloud.tracks import TRACKS, Speeds
-from agv_plant.unicycle import euler_step
+from agv_plant.vehicle.unicycle import euler_step
 from agv_ros.errors import UserError
 
 

@@ -23,7 +23,7 @@ POLICIES = ("hold", "align", "predict")
 HOLD, ALIGN, PREDICT = range(3)
 
 Step = Callable[[float, float, float, float, float, float], tuple[float, float, float]]
-"""One sampling period of the plant, as `agv_plant.unicycle.euler_step`."""
+"""One sampling period of the plant, as `agv_plant.vehicle.unicycle.euler_step`."""
 
 
 class Posture(NamedTuple):

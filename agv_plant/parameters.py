@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 from agv_plant.channels.coverage_hole import NO_HOLES
 from agv_plant.channels.coverage_hole import rows_of as holes
-from agv_plant.channels.installed import SHARED, TRACE, known_models
-from agv_plant.channels.placed import EVERYWHERE, kind_of
-from agv_plant.channels.schedule import Entry, parse_schedule
-from agv_plant.channels.shared import SCHEDULERS
+from agv_plant.channels.position_dependent import EVERYWHERE, kind_of
+from agv_plant.channels.registry import SHARED, TRACE, known_models
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
-from agv_plant.unicycle import STEPS
+from agv_plant.radio.schedule import Entry, parse_schedule
+from agv_plant.radio.shared_uplink import SCHEDULERS
+from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES, TWIST
 from agv_ros.parameters import LoopParameters, ParameterError, TwoDomains, group, parameter, parameters_of
 

@@ -18,19 +18,13 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
+from agv_plant.deadline_monitor import Punctuality
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
-from agv_plant.held_command import HeldCommand
-from agv_plant.motion import NOISE, SLIP, Motion, body_of, measured, move
 from agv_plant.parameters import PlantParameters
-from agv_plant.punctuality import Punctuality
 from agv_plant.random_stream import normals_of
-from agv_plant.unicycle import State
-from agv_ros.executor import run_node
-from agv_ros.node import LoopNode
-from agv_ros.message_sync import Joined, SlotJoin
-from agv_ros.speeds_codec import decode_speeds
-from agv_ros.stamps import to_nanoseconds
-from agv_ros.transforms import TransformBroadcaster
+from agv_plant.vehicle.motion import NOISE, SLIP, Motion, body_of, measured, move
+from agv_plant.vehicle.unicycle import State
+from agv_plant.zero_order_hold import HeldCommand
 from agv_ros.codec import (
     FRAME_AGV,
     Command,
@@ -42,6 +36,12 @@ from agv_ros.codec import (
     encode_pose,
     stamp_of,
 )
+from agv_ros.executor import run_node
+from agv_ros.message_sync import Joined, SlotJoin
+from agv_ros.node import LoopNode
+from agv_ros.speeds_codec import decode_speeds
+from agv_ros.stamps import to_nanoseconds
+from agv_ros.transforms import TransformBroadcaster
 
 D = TypeVar("D")
 

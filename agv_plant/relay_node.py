@@ -13,12 +13,9 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from agv_plant.channels.placed import NOWHERE
+from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.parameters import RelayParameters
-from agv_plant.radio import Channel, Link, Passage
-from agv_ros.executor import run_node
-from agv_ros.message_types import ODOMETRY, TWIST
-from agv_ros.node import LoopNode, Output
+from agv_plant.radio.link import Channel, Link, Passage
 from agv_ros.codec import (
     InvalidMessageError,
     decode_command,
@@ -28,6 +25,9 @@ from agv_ros.codec import (
     encode_twist,
     stamp_of,
 )
+from agv_ros.executor import run_node
+from agv_ros.message_types import ODOMETRY, TWIST
+from agv_ros.node import LoopNode, Output
 
 _LOOK_PERIOD = 1.0
 """How often [s] the relay looks whether anything but itself joins the AGV's domain and the edge's."""

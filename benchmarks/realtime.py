@@ -34,7 +34,7 @@ def _bare_timer() -> dict[str, float]:
     from rclpy.clock import Clock, ClockType
     from rclpy.node import Node
 
-    from agv_plant.punctuality import Punctuality
+    from agv_plant.deadline_monitor import Punctuality
     from agv_ros.executor import EXECUTORS, spin_for
 
     context = rclpy.Context()

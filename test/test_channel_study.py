@@ -16,7 +16,7 @@ from agv_analysis.channel_netem import NetemError, from_netem, to_netem
 from agv_analysis.channel_study import age_distribution, fitted, study
 from agv_analysis.stability.chain import bernoulli, gilbert_elliott
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
+from agv_plant.radio.link import losses
 
 AgvNcs = Callable[..., tuple[int, str]]
 

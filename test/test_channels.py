@@ -24,7 +24,7 @@ from agv_plant.channels.burst import burst
 from agv_plant.channels.gilbert_elliott import gilbert_elliott
 from agv_plant.channels.perfect import perfect
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
+from agv_plant.radio.link import losses
 from agv_ros.parameters import build
 
 Verdicts = NDArray[np.bool_]

@@ -21,11 +21,11 @@ from agv_analysis.simulation.on_air import Marks, blank, listen
 from agv_analysis.simulation.verdicts import Air
 from agv_analysis.stability.margins import left_out
 from agv_analysis.stability.verdict import ASYMPTOTIC, UNKNOWN, UNSTABLE
-from agv_plant.channels.delay import EXPIRED, delay_in_slots, whole_slots
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, Link, losses
-from agv_ros.stamps import Grid
+from agv_plant.radio.delay import EXPIRED, delay_in_slots, whole_slots
+from agv_plant.radio.link import Channel, Link, losses
 from agv_ros.codec import DELAYED, DELIVERED, LOST, facts_in
+from agv_ros.stamps import Grid
 from test.test_links import last_words
 
 if TYPE_CHECKING:

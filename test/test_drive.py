@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agv_plant.actuator import driven_speeds
 from agv_plant.downlink_policy import HOLD, RAMP, ZERO, share_of_command
+from agv_plant.vehicle.drive import driven_speeds
 
 number = st.floats(-1e3, 1e3)
 

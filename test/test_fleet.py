@@ -21,7 +21,7 @@ from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.verdicts import Air
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, delay_draws, losses
+from agv_plant.radio.link import Channel, delay_draws, losses
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:

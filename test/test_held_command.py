@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_plant.held_command import HeldCommand
+from agv_plant.zero_order_hold import HeldCommand
 from agv_ros.codec import Command
 
 TIMEOUT = 100

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from agv_plant.channels import MODELS
-from agv_plant.channels.installed import GROUP, known_models
-from agv_plant.channels.placed import PLACED
+from agv_plant.channels.position_dependent import PLACED
+from agv_plant.channels.registry import GROUP, known_models
 from agv_plant.random_stream import uniforms
 
 REPOSITORY = Path(__file__).parents[1]
@@ -22,7 +22,7 @@ CHANNEL = ("--set", "relay.uplink.model=roadworks", "--set", "relay.uplink.argum
 SAME = """
 from agv_analysis.simulation.verdicts import Air
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
+from agv_plant.radio.link import losses
 channel = ChannelParameters(model="roadworks", arguments=(0.5, 20.0, 200.0))
 found = losses(channel, 3, "uplink", 5000)
 assert (Air(3, 5000).verdicts(channel, "uplink") == found).all()

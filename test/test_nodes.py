@@ -28,7 +28,7 @@ from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
 from agv_plant.relay_node import RelayNode
-from agv_plant.unicycle import arc_step
+from agv_plant.vehicle.unicycle import arc_step
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS, LoopNode

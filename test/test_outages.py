@@ -15,7 +15,7 @@ from agv_analysis.outages import age_statistics, ages, outage_lengths, outages
 from agv_analysis.run import Run
 from agv_analysis.scenario import parse_scenario
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
+from agv_plant.radio.link import losses
 from agv_ros.errors import UserError
 
 Verdicts = NDArray[np.bool_]

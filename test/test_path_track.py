@@ -14,7 +14,7 @@ from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.path_track import Curve, PathError, PathReference, PathTrack
 from agv_cloud.reference import Reference
 from agv_cloud.reference_path import MOST_POINTS, thinned
-from agv_plant.unicycle import euler_step
+from agv_plant.vehicle.unicycle import euler_step
 from agv_ros.errors import UserError
 
 TS = 0.005

@@ -24,11 +24,11 @@ from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.simulation.on_air import blank, listen
 from agv_analysis.simulation.verdicts import Air
 from agv_plant.channels.coverage_hole import is_in_hole, rows_of
-from agv_plant.channels.placed import PLACED
+from agv_plant.channels.position_dependent import PLACED
 from agv_plant.channels.rayleigh import SPEED_OF_LIGHT, fades_per_metre, fading_gain, loss_rate
 from agv_plant.channels.rayleigh import rows_of as waves_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, losses
+from agv_plant.radio.link import Channel, losses
 from agv_ros.parameters import ParameterError
 
 NONE = (0.0,)

@@ -16,10 +16,10 @@ from agv_analysis.simulation import simulate, simulate_batch
 from agv_cloud.plan import next_error
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import BUFFER, share_of_command
-from agv_plant.unicycle import STEPS
+from agv_plant.vehicle.unicycle import STEPS
+from agv_ros.codec import InvalidMessageError
 from agv_ros.parameters import ParameterError
 from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
-from agv_ros.codec import InvalidMessageError
 
 PAPER = str(Path(__file__).parents[1] / "config" / "paper.yaml")
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_plant.punctuality import Punctuality
+from agv_plant.deadline_monitor import Punctuality
 
 PERIOD = 5_000_000
 

@@ -17,8 +17,8 @@ from mcap.writer import Writer
 from agv_analysis.convergence import wrapped
 from agv_analysis.recording import read_run
 from agv_analysis.scenario import load_scenario
-from agv_ros.errors import UserError
 from agv_ros.codec import DELAYED, DELIVERED, LOST, decode_slot, encode_slot
+from agv_ros.errors import UserError
 
 REPOSITORY = Path(__file__).parents[1]
 SAMPLE = REPOSITORY / "bags/sample"

@@ -34,10 +34,10 @@ from agv_analysis.run import Run
 from agv_analysis.scenario import SCHEMAS
 from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import load_trace
+from agv_ros.codec import DELIVERED, Pose, Slot, encode_clock, stamp_of
 from agv_ros.errors import UserError
 from agv_ros.message_sync import SlotJoin
 from agv_ros.stamps import Grid
-from agv_ros.codec import DELIVERED, Pose, Slot, encode_clock, stamp_of
 
 if TYPE_CHECKING:
     from test.conftest import Drive, Start

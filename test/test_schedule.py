@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 from agv_analysis.cli import main
 from agv_analysis.simulation.verdicts import Air
 from agv_analysis.stability.chain import chain_of
-from agv_plant.channels.schedule import OUTAGE, is_scripted
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, losses
+from agv_plant.radio.link import Channel, losses
+from agv_plant.radio.schedule import OUTAGE, is_scripted
 from agv_ros.parameters import ParameterError, build
 from agv_ros.ros_yaml import load
 

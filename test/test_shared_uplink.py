@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from agv_analysis.simulation.verdicts import Air
-from agv_plant.channels.shared import OLDEST_FIRST, RANDOM, ROUND_ROBIN, SCHEDULERS, serve_all
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, losses
+from agv_plant.radio.link import Channel, losses
+from agv_plant.radio.shared_uplink import OLDEST_FIRST, RANDOM, ROUND_ROBIN, SCHEDULERS, serve_all
 from agv_ros.parameters import ParameterError
 
 

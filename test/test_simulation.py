@@ -18,7 +18,7 @@ from agv_analysis.convergence import convergence
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_plant.radio import Channel
+from agv_plant.radio.link import Channel
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parent.parent / "config" / "paper.yaml")

@@ -15,7 +15,7 @@ from agv_analysis.simulation import STATISTICS, simulate, simulate_batch
 from agv_analysis.simulation.batch import _Batch
 from agv_analysis.simulation.verdicts import Air
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
+from agv_plant.radio.link import losses
 from agv_ros.errors import UserError
 
 OUTAGES = str(Path(__file__).parent.parent / "config" / "outages.yaml")

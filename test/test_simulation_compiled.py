@@ -16,7 +16,7 @@ from agv_analysis.simulation import simulate
 from agv_analysis.simulation.loop import Case, at_rest, history, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import losses
+from agv_plant.radio.link import losses
 
 ROOT = Path(__file__).parent.parent
 PAPER = str(ROOT / "config" / "paper.yaml")

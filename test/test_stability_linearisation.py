@@ -22,7 +22,7 @@ from agv_analysis.stability.paper import matrices
 from agv_cloud.control_law import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.unicycle import State, euler_step
+from agv_plant.vehicle.unicycle import State, euler_step
 
 TS = 0.005
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from agv_cloud.control_law import control_law
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference import Reference
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.unicycle import euler_step
+from agv_plant.vehicle.unicycle import euler_step
 
 if TYPE_CHECKING:
     from test.conftest import Lap

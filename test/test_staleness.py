@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_cloud.staleness import Posture, Prediction
-from agv_plant.unicycle import STEPS, euler_step
+from agv_plant.vehicle.unicycle import STEPS, euler_step
 
 PAPER = str(Path(__file__).parents[1] / "config/paper.yaml")
 

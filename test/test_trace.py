@@ -16,7 +16,7 @@ from agv_analysis.simulation.single import simulate
 from agv_analysis.simulation.verdicts import Air
 from agv_plant.channels.trace import TraceError, load_trace, parse_json_trace, parse_trace, trace
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, losses
+from agv_plant.radio.link import Channel, losses
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:

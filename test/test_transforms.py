@@ -27,8 +27,8 @@ from agv_analysis.other_robots import RobotTopics, read_robot_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_cloud.reference import Reference
-from agv_ros.transforms import TOPIC
 from agv_ros.codec import Pose, decode_odometry, decode_pose, encode_transform
+from agv_ros.transforms import TOPIC
 
 REPOSITORY = Path(__file__).parents[1]
 STORE = get_typestore(Stores.ROS2_JAZZY)

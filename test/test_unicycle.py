@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from agv_plant.unicycle import STEPS, arc_step, euler_step
+from agv_plant.vehicle.unicycle import STEPS, arc_step, euler_step
 
 Step = Callable[[float, float, float, float, float, float], tuple[float, float, float]]
 

@@ -29,7 +29,7 @@ from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.single import settings_of, steps_of
 from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_plant.motion import NOISE, SLIP
+from agv_plant.vehicle.motion import NOISE, SLIP
 
 STATISTICS = np.dtype([
     *((name, np.dtype(kind)) for name, kind in get_type_hints(Statistics).items()), ("contraction", np.dtype(float))

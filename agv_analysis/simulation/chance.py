@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.simulation.loop import Rows
-from agv_plant.motion import measured
 from agv_plant.random_stream import DRAWS, normal_pair, uniforms
+from agv_plant.vehicle.motion import measured
 
 
 def normals(seed: int, stream: str, steps: int) -> Floats:

@@ -12,7 +12,7 @@ from agv_analysis.run import LinkSlots
 from agv_analysis.simulation.on_air import Marks, Way, blank
 from agv_analysis.simulation.verdicts import Air, Verdicts, way_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, draws
+from agv_plant.radio.link import Channel, draws
 
 
 class SimulatedLink:

@@ -23,7 +23,7 @@ from agv_cloud.plan import next_error
 from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import share_of_command
-from agv_plant.motion import Body, Motion, measured, move, plant_step
+from agv_plant.vehicle.motion import Body, Motion, measured, move, plant_step
 
 Rows = NDArray[np.float64] | list[list[float]]
 Flags = NDArray[np.bool_] | list[bool]

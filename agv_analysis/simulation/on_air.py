@@ -39,8 +39,8 @@ from agv_analysis.simulation.loop import (
     wheels,
 )
 from agv_cloud.staleness import PREDICT
-from agv_plant.channels.placed import EVERYWHERE, verdict_at
-from agv_plant.motion import plant_step
+from agv_plant.channels.position_dependent import EVERYWHERE, verdict_at
+from agv_plant.vehicle.motion import plant_step
 
 
 class Way(NamedTuple):

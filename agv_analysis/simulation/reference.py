@@ -13,7 +13,7 @@ from agv_analysis.run import Floats
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference import Reference, lap_steps
 from agv_cloud.tracks import TRACKS
-from agv_plant.unicycle import euler_step
+from agv_plant.vehicle.unicycle import euler_step
 
 
 def reference_of(detector: ErrorDetectorParameters, steps: int) -> Floats:

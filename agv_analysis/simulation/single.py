@@ -16,8 +16,8 @@ from agv_analysis.simulation.on_air import history_on_air
 from agv_analysis.simulation.reference import reference_of
 from agv_cloud.staleness import POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
-from agv_plant.motion import NOISE, SLIP, body_of
 from agv_plant.parameters import PlantParameters
+from agv_plant.vehicle.motion import NOISE, SLIP, body_of
 from agv_ros.errors import UserError
 
 _PAPERS_BODY = body_of(PlantParameters())

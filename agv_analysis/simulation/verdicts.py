@@ -1,4 +1,4 @@
-"""Verdicts of a channel on a whole run, compiled: those of `agv_plant.radio.Channel`, bit for bit.
+"""Verdicts of a channel on a whole run, compiled: those of `agv_plant.radio.link.Channel`, bit for bit.
 
 The same models, the same random numbers; only the loop over the slots is another one, since that of the relay asks for
 one slot at a time.
@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, compiled_with, numbers
 from agv_analysis.simulation.chance import normals
 from agv_analysis.simulation.on_air import Way
-from agv_plant.channel_setup import Segment, floor_of, levels_of, segments_of
 from agv_plant.channels import GOOD, MODELS
-from agv_plant.channels.delay import NEVER, delays_of, soonest
-from agv_plant.channels.installed import SHARED, TRACE, find_model
-from agv_plant.channels.placed import kind_of
-from agv_plant.channels.schedule import is_scripted
-from agv_plant.channels.shared import SCHEDULERS, serve_all, stream_of
+from agv_plant.channels.position_dependent import kind_of
+from agv_plant.channels.registry import SHARED, TRACE, find_model
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio import Channel, delay_draws, draws, losses, own_stream
+from agv_plant.radio.channel_setup import Segment, floor_of, levels_of, segments_of
+from agv_plant.radio.delay import NEVER, delays_of, soonest
+from agv_plant.radio.link import Channel, delay_draws, draws, losses, own_stream
+from agv_plant.radio.schedule import is_scripted
+from agv_plant.radio.shared_uplink import SCHEDULERS, serve_all, stream_of
 from agv_plant.random_stream import uniforms
 from agv_ros.parameters import LoopParameters
 

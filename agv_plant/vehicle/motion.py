@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from agv_plant.actuator import driven_speeds
-from agv_plant.slip import over_ground, side_slip
-from agv_plant.unicycle import arc_step, euler_step
+from agv_plant.vehicle.drive import driven_speeds
+from agv_plant.vehicle.slip import over_ground, side_slip
+from agv_plant.vehicle.unicycle import arc_step, euler_step
 
 if TYPE_CHECKING:
     from agv_plant.parameters import PlantParameters

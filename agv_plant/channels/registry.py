@@ -6,7 +6,7 @@ import functools
 from importlib.metadata import EntryPoint, entry_points
 
 from agv_plant.channels import MODELS, Model
-from agv_plant.channels.placed import PLACED
+from agv_plant.channels.position_dependent import PLACED
 from agv_ros.errors import UserError
 
 GROUP = "agv_ncs.channels"

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from agv_plant.channels.delay import whole_slots
+from agv_plant.radio.delay import whole_slots
 from agv_ros.parameters import Parameter, ParameterError
 
 OUTAGE = "outage"

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from agv_plant.channels.coverage_hole import rows_of as holes
-from agv_plant.channels.delay import whole_slots
 from agv_plant.channels.rayleigh import rows_of as waves
-from agv_plant.channels.schedule import OUTAGE, Outage
 from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.delay import whole_slots
+from agv_plant.radio.schedule import OUTAGE, Outage
 
 UPLINK = "uplink"
 """The stream with which a correlated channel has its random numbers or its field in common."""

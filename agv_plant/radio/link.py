@@ -12,19 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_plant.channel_setup import UPLINK, Segment, floor_of, levels_of, segments_of
 from agv_plant.channels import GOOD, Model
-from agv_plant.channels.delay import EXPIRED, delays_of, whole_slots
-from agv_plant.channels.installed import SHARED, TRACE, ChannelError, find_model
-from agv_plant.channels.placed import NOWHERE, kind_of, verdict_at
-from agv_plant.channels.schedule import OUTAGE, is_scripted
-from agv_plant.channels.shared import SCHEDULERS, serve, stream_of
+from agv_plant.channels.position_dependent import NOWHERE, kind_of, verdict_at
+from agv_plant.channels.registry import SHARED, TRACE, ChannelError, find_model
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.channel_setup import UPLINK, Segment, floor_of, levels_of, segments_of
+from agv_plant.radio.delay import EXPIRED, delays_of, whole_slots
+from agv_plant.radio.schedule import OUTAGE, is_scripted
+from agv_plant.radio.shared_uplink import SCHEDULERS, serve, stream_of
 from agv_plant.random_stream import InBlocks, uniforms
+from agv_ros.codec import DELAYED, DELIVERED, LOST, Slot
 from agv_ros.parameters import LoopParameters
 from agv_ros.stamps import Grid, NearestSteps, Steps
-from agv_ros.codec import DELAYED, DELIVERED, LOST, Slot
 
 _BLOCK = 4096
 

@@ -1,0 +1,1 @@
+"""One direction of the radio link: which messages are lost, how late the others are, what the receiver holds."""

@@ -1,0 +1,1 @@
+"""Vehicles: what an AGV makes of a command in one sampling period."""
