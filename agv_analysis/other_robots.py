@@ -21,7 +21,7 @@ from agv_analysis.plans import read_reference
 from agv_analysis.posture_track import Steps, Track, by_the_clock_of, messages_of, read_poses, stamps_of
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.ros_yaml import RosYamlError, load
 from agv_ros.stamps import MAX_LEAP, NS_PER_S

@@ -25,7 +25,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import answer, at_rest, received
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.parameters import PATH
-from agv_cloud.reference import Reference, ReferencePoint
+from agv_cloud.reference.reference import Reference, ReferencePoint
 from agv_cloud.staleness import Posture, Prediction
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.codec import Command, InvalidMessageError, TrackingError, decode_slot, stamp_of

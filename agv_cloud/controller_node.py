@@ -9,9 +9,9 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.plan import planned_commands
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.plan import planned_commands
 from agv_ros.codec import FRAME_AGV, Command, TrackingError, decode_error, encode_command, encode_twist
 from agv_ros.executor import run_node
 from agv_ros.message_types import TWIST_STAMPED

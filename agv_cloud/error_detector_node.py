@@ -17,11 +17,11 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from agv_cloud.freshest_pose import FreshestPose
+from agv_cloud.clock_offset import FreshestPose
 from agv_cloud.parameters import PATH, ErrorDetectorParameters
-from agv_cloud.path_track import Curve, PathError, PathReference, PathTrack, Point
-from agv_cloud.reference import Reference, ReferencePoint
-from agv_cloud.reference_path import path_points, thinned
+from agv_cloud.reference.path_track import Curve, PathError, PathReference, PathTrack, Point
+from agv_cloud.reference.reference import Reference, ReferencePoint
+from agv_cloud.reference.thinned_path import path_points, thinned
 from agv_cloud.staleness import Posture, Prediction
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.vehicle.unicycle import STEPS

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from agv_cloud.reference.tracks import TRACKS
 from agv_cloud.staleness import POLICIES
-from agv_cloud.tracks import TRACKS
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES
 from agv_ros.parameters import LoopParameters, ParameterError, parameter

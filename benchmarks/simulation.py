@@ -25,7 +25,7 @@ from agv_analysis.simulation import simulate_batch
 from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.loop import Case, at_rest, statistics_of_two
 from agv_analysis.simulation.single import settings_of
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from agv_plant.radio.link import losses
 from benchmarks.comparison import Comparison
 

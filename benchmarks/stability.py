@@ -20,7 +20,7 @@ from agv_analysis.stability import lifted, paper
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.margin_map import around, margin_map
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from benchmarks.comparison import Comparison
 
 CONFIG = str(Path(__file__).parent.parent / "config" / "paper.yaml")

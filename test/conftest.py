@@ -80,7 +80,7 @@ def lap() -> Lap:
 
     def reference(track: str, steps: int = 20_000) -> tuple[Floats, Floats, Floats]:
         from agv_analysis.scenario import load_scenario
-        from agv_cloud.reference import Reference
+        from agv_cloud.reference.reference import Reference
 
         settings = [f"error_detector.track={track}", f"error_detector.lap_time={steps * 0.005}"]
         scenario = load_scenario(str(REPOSITORY / "config/paper.yaml"), settings)

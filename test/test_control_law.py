@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.tracking_error import tracking_error
 
 error = st.floats(-10.0, 10.0)

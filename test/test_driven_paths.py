@@ -31,7 +31,7 @@ from agv_analysis.scenario import load_scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
 from test.test_nodes import Bench, pose

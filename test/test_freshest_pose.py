@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_cloud.freshest_pose import BELIEVED_NS, IN_A_ROW, WINDOW_NS, FreshestPose
+from agv_cloud.clock_offset import BELIEVED_NS, IN_A_ROW, WINDOW_NS, FreshestPose
 from agv_ros.codec import Pose
 
 MS = 1_000_000

@@ -57,10 +57,10 @@ def of_ros(source: str) -> list[str]:
 
 
 def test_the_check_sees_what_it_is_for() -> None:
-    source = "import agv_cloud.tracks\ndef f():\n  from agv_analysis import run\n  import rclpy.node, numpy\n"
+    source = "import agv_cloud.reference.tracks\ndef f():\n  from agv_analysis import run\n  import rclpy.node, numpy\n"
     source += "from geometry_msgs.msg import Twist\nfrom mcap_ros2.decoder import Decoder\nimport agv_ros.stamps\n"
-    assert sorted(upwards("agv_plant.radio.link", source)) == ["agv_analysis", "agv_cloud.tracks"]
-    assert upwards("agv_cloud.tracks", source) == ["agv_analysis"]
+    assert sorted(upwards("agv_plant.radio.link", source)) == ["agv_analysis", "agv_cloud.reference.tracks"]
+    assert upwards("agv_cloud.reference.tracks", source) == ["agv_analysis"]
     assert sorted(of_ros(source)) == ["geometry_msgs.msg", "rclpy.node"]
 
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.path_track import Curve, PathError, PathReference, PathTrack
-from agv_cloud.reference import Reference
-from agv_cloud.reference_path import MOST_POINTS, thinned
+from agv_cloud.reference.path_track import Curve, PathError, PathReference, PathTrack
+from agv_cloud.reference.reference import Reference
+from agv_cloud.reference.thinned_path import MOST_POINTS, thinned
 from agv_plant.vehicle.unicycle import euler_step
 from agv_ros.errors import UserError
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from agv_analysis.simulation.reference import reference_of
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference, lap_steps, speeds_of
-from agv_cloud.track_file import TrackFileError
-from agv_cloud.tracks import TRACKS
+from agv_cloud.reference.reference import Reference, lap_steps, speeds_of
+from agv_cloud.reference.track_file import TrackFileError
+from agv_cloud.reference.tracks import TRACKS
 
 Point = tuple[float, float, float, float, float]
 

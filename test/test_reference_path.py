@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference
-from agv_cloud.reference_path import LONGEST, MOST_POINTS, path_points
+from agv_cloud.reference.reference import Reference
+from agv_cloud.reference.thinned_path import LONGEST, MOST_POINTS, path_points
 
 
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario, parse_scenario
-from agv_cloud.tracks import TRACKS
+from agv_cloud.reference.tracks import TRACKS
 from agv_plant.channels import MODELS
 from agv_ros.parameters import Parameter, ParameterError, as_dict, parameters_of
 from agv_ros.stamps import Grid

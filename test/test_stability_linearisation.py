@@ -19,7 +19,7 @@ from agv_analysis.stability.linearisation import (
     step_matrices,
 )
 from agv_analysis.stability.paper import matrices
-from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.vehicle.unicycle import State, euler_step

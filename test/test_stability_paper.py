@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability import almost_sure
 from agv_analysis.stability.paper import largest_n, matrices, spectral_radii
-from agv_cloud.control_law import control_law
+from agv_cloud.control.kanayama import control_law
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.vehicle.unicycle import euler_step
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_cloud.track_file import TrackFileError, load_track, parse_track
+from agv_cloud.reference.track_file import TrackFileError, load_track, parse_track
 from agv_ros.errors import UserError
 
 speed = st.floats(-10.0, 10.0)

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.special import j0
 
-from agv_cloud.tracks import J0_FIRST_ZERO, TRACKS, circle, eight, line, paper, warehouse
+from agv_cloud.reference.tracks import J0_FIRST_ZERO, TRACKS, circle, eight, line, paper, warehouse
 
 TS, N = 0.005, 20_000
 LAPS = [16, 17, 27, 28, 39, 100, 101, 777, 1000, 1001, 4999, 20_000, 20_001]

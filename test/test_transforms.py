@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from agv_analysis.other_robots import RobotTopics, read_robot_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from agv_ros.codec import Pose, decode_odometry, decode_pose, encode_transform
 from agv_ros.transforms import TOPIC
 

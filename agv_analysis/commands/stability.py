@@ -96,7 +96,7 @@ def command(
 def _twins(scenario: Scenario) -> tuple[Twins, range]:
     """Twins of one lap of the scenario, or of all of it where it has an end, under several seeds."""
     from agv_analysis.stability.empirical import simulated_twins
-    from agv_cloud.reference import lap_steps
+    from agv_cloud.reference.reference import lap_steps
 
     if not math.isfinite(scenario.plant.duration):
         lap = lap_steps(scenario.error_detector) * scenario.plant.ts

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from agv_analysis.scenario import Scenario
+from agv_cloud.reference.tracks import TRACKS
 from agv_cloud.staleness import POLICIES
-from agv_cloud.tracks import TRACKS
 from agv_plant.channels import MODELS
 from agv_plant.parameters import PlantParameters, RelayParameters
 from agv_ros.parameters import LoopParameters, as_dict

@@ -12,7 +12,7 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.simulation.single import simulate, steps_of
-from agv_cloud.reference import Reference
+from agv_cloud.reference.reference import Reference
 from agv_plant.parameters import ChannelParameters
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.convergence import NEGLIGIBLE, SHARE, TOLERANCE
-from agv_cloud.control_law import control_law, limit_speed
-from agv_cloud.plan import next_error
+from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.plan import next_error
 from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import share_of_command

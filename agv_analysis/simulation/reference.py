@@ -1,4 +1,4 @@
-"""The reference of a whole run, compiled: that of `agv_cloud.reference`, bit for bit."""
+"""The reference of a whole run, compiled: that of `agv_cloud.reference.reference`, bit for bit."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from agv_analysis.compiled import compiled_with
 from agv_analysis.run import Floats
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference import Reference, lap_steps
-from agv_cloud.tracks import TRACKS
+from agv_cloud.reference.reference import Reference, lap_steps
+from agv_cloud.reference.tracks import TRACKS
 from agv_plant.vehicle.unicycle import euler_step
 
 

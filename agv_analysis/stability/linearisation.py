@@ -34,7 +34,7 @@ from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.products import multiply
-from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
 

@@ -15,7 +15,7 @@ from agv_analysis.stability import almost_sure, both_links, bursts, floquet, lif
 from agv_analysis.stability.chain import chain_of
 from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference import lap_steps
+from agv_cloud.reference.reference import lap_steps
 from agv_plant.parameters import ChannelParameters, PlantParameters
 from agv_ros.parameters import SHARED, as_dict
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_cloud.parameters import CSV, PATH, ErrorDetectorParameters
-from agv_cloud.track_file import load_track
-from agv_cloud.tracks import TRACKS, Speeds
+from agv_cloud.reference.track_file import load_track
+from agv_cloud.reference.tracks import TRACKS, Speeds
 from agv_plant.vehicle.unicycle import euler_step
 from agv_ros.errors import UserError
 

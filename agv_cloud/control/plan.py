@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from agv_cloud.control_law import control_law, limit_speed
+from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.vehicle.motion import plant_step
 from agv_plant.vehicle.unicycle import euler_step

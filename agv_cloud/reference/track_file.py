@@ -7,7 +7,7 @@ import csv
 import math
 from collections.abc import Iterable
 
-from agv_cloud.tracks import Speeds
+from agv_cloud.reference.tracks import Speeds
 from agv_ros.errors import UserError, open_text
 
 

@@ -1,0 +1,1 @@
+"""Control laws: from the tracking error to a command."""

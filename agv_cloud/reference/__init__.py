@@ -1,0 +1,1 @@
+"""The reference: tracks, track files and paths, sampled by the loop."""
