@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 
 from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
-from agv_analysis.channel_fit import Estimate
+from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.outages import loss_causes
 
 

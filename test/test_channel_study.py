@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_analysis.channel_netem import NetemError, from_netem, to_netem
-from agv_analysis.channel_study import age_distribution, fitted, study
-from agv_analysis.stability.chain import bernoulli, gilbert_elliott
+from agv_analysis.link.channel_study import age_distribution, fitted, study
+from agv_analysis.link.markov_channel import bernoulli, gilbert_elliott
+from agv_analysis.link.netem import NetemError, from_netem, to_netem
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
 

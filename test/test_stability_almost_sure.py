@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_elliott
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.almost_sure import (
@@ -21,7 +22,6 @@ from agv_analysis.stability.almost_sure import (
     is_degenerate,
     sample_losses,
 )
-from agv_analysis.stability.chain import Chain, bernoulli, bursty, gilbert_elliott
 from agv_analysis.stability.linearisation import step_matrices
 from agv_cloud.parameters import ControllerParameters
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.stability.chain import Chain, bernoulli, bursty, chain_of, gilbert_elliott, shortest_mean_burst
+from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, chain_of, gilbert_elliott, shortest_mean_burst
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
 from agv_ros.parameters import build

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.stability.almost_sure import exponent_along
-from agv_analysis.stability.chain import Chain, bernoulli, gilbert_elliott
 from agv_analysis.stability.gains import (
     best_almost_surely,
     best_for_bursts,

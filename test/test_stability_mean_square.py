@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.stability.chain import Chain, bernoulli, bursty, gilbert_elliott
+from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_elliott
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.mean_square import (
     along_spectral_radius,

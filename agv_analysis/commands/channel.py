@@ -11,7 +11,7 @@ import click
 from agv_analysis.commands import with_settings, write_json
 
 if TYPE_CHECKING:
-    from agv_analysis.channel_study import ChannelStudy
+    from agv_analysis.link.channel_study import ChannelStudy
 
 
 @click.command("channel")
@@ -51,9 +51,9 @@ def command(
     from rich.console import Console
     from rich.table import Table
 
-    from agv_analysis.channel_netem import from_netem as channel_of
-    from agv_analysis.channel_netem import to_netem
-    from agv_analysis.channel_study import draw, fitted, study, write_csv
+    from agv_analysis.link.channel_study import draw, fitted, study, write_csv
+    from agv_analysis.link.netem import from_netem as channel_of
+    from agv_analysis.link.netem import to_netem
     from agv_analysis.scenario import load_scenario
     from agv_analysis.simulation.reference import reference_of
     from agv_plant.channels.trace import load_trace

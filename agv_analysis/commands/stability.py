@@ -116,7 +116,7 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
 
     None behind a predictor, for a channel that is no Markov chain or loses all; the reason is that of `best_kx`.
     """
-    from agv_analysis.stability.chain import chain_of
+    from agv_analysis.link.markov_channel import chain_of
     from agv_analysis.stability.gains import WHY_A_TOLERANCE, best_kx
 
     chain, model = chain_of(scenario.relay.uplink), scenario.relay.uplink.model

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
+from agv_analysis.link.markov_channel import Chain, bernoulli
 from agv_analysis.run import Floats
-from agv_analysis.stability.chain import Chain, bernoulli
 from agv_analysis.stability.linearisation import HELD, Edge, reachable, reception_maps, seen, step_matrices
 from agv_analysis.stability.mean_square import crossing
 from agv_analysis.stability.products import orthogonalised_pass

@@ -24,8 +24,8 @@ import math
 import numpy as np
 
 from agv_analysis.compiled import compiled
+from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats
-from agv_analysis.stability.chain import Chain
 from agv_analysis.stability.linearisation import HELD, Edge, is_constant, reachable, seen, step_matrices
 from agv_analysis.stability.mean_square import settled_growth
 from agv_cloud.parameters import ControllerParameters

@@ -21,8 +21,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats
-from agv_analysis.stability.chain import Chain
 from agv_analysis.stability.mean_square import along_spectral_radius
 
 TOLERANCE = 0.1

@@ -24,8 +24,8 @@ from collections.abc import Callable
 import numpy as np
 
 from agv_analysis.compiled import compiled
+from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.run import Floats
-from agv_analysis.stability.chain import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.stability.linearisation import HELD, MARGINAL, Edge, is_constant, reachable, seen, step_matrices
 from agv_analysis.stability.products import multiply
 from agv_cloud.parameters import ControllerParameters

@@ -16,7 +16,7 @@ from agv_analysis.sweep.plan import Axis, Sweep, SweepError, varied
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from agv_analysis.stability.chain import Chain
+    from agv_analysis.link.markov_channel import Chain
 
 BORDERS = {"mean square": "#d62728", "almost surely": "#ff9f1c"}
 """Borders of stability along a straight track by name, with their colours."""
@@ -154,7 +154,7 @@ def _renewals(scenario: Scenario) -> Chain | None:
 
     None if it is none, if its messages come late, or if the downlink does anything to its own.
     """
-    from agv_analysis.stability.chain import chain_of
+    from agv_analysis.link.markov_channel import chain_of
 
     uplink, downlink = scenario.relay.uplink, scenario.relay.downlink
     is_late = any(link.delay > 0.0 or link.jitter > 0.0 for link in (uplink, downlink))

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.channel_fit import ChannelFit, fit_channel
 from agv_analysis.compiled import compiled, numbers
+from agv_analysis.link.channel_fit import ChannelFit, fit_channel
+from agv_analysis.link.markov_channel import Chain, chain_of
 from agv_analysis.outages import LinkOutages, Steps, Verdicts, ages, link_outages
 from agv_analysis.run import Floats
 from agv_analysis.simulation.on_air import blank, listen
 from agv_analysis.simulation.verdicts import Air
-from agv_analysis.stability.chain import Chain, chain_of
 from agv_plant.channels.rayleigh import fades_per_metre, loss_rate
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.confidence import clopper_pearson
-from agv_analysis.stability.chain import Chain, bernoulli, gilbert_elliott
+from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 
 SIGNIFICANCE = 0.01
 """Independent losses are given up where verdicts as bursty as these would be rarer than this under them."""

@@ -1,0 +1,1 @@
+"""From a recorded bag to a run: recordings of this loop, and those of other robots."""

@@ -1,0 +1,1 @@
+"""Running the nodes: one process or several, fleets, replay, the recorder."""
