@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.convergence import Convergence, convergence
 from agv_analysis.link.channel_fit import ChannelFit, fit_channel
-from agv_analysis.outages import Outages, loss_causes, outages
+from agv_analysis.metrics.convergence import Convergence, convergence
+from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Floats, LinkSlots, Run
 from agv_analysis.stability import both_links, bursts, floquet, late, lifted, mean_square, paper
 from agv_analysis.stability.bursts import BurstVerdict

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.analysis import analyse
-from agv_analysis.confidence import CONFIDENCE, clopper_pearson
+from agv_analysis.metrics.confidence import CONFIDENCE, clopper_pearson
 from agv_analysis.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario

@@ -16,7 +16,7 @@ import numpy as np
 
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.bags.layout import LOG_TIME
-from agv_analysis.outages import ages
+from agv_analysis.metrics.outages import ages
 from agv_analysis.plans import read_reference
 from agv_analysis.posture_track import Steps, Track, by_the_clock_of, messages_of, read_poses, stamps_of
 from agv_analysis.run import Floats, Run

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from agv_analysis.convergence import TOLERANCE
+from agv_analysis.metrics.convergence import TOLERANCE
 from agv_analysis.run import Floats, Run
 from agv_ros.errors import UserError
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags import read_bag
-from agv_analysis.convergence import wrapped
+from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.recording import TOPICS, loop_topics
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.link.channel_fit import Estimate
-from agv_analysis.outages import loss_causes
+from agv_analysis.metrics.outages import loss_causes
 
 
 def print_table(analysis: Observations) -> None:

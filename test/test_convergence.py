@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.convergence import (
+from agv_analysis.metrics.convergence import (
     body_errors,
     convergence,
     damping,

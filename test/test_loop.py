@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from agv_analysis.analysis import analyse
-from agv_analysis.convergence import convergence
+from agv_analysis.metrics.convergence import convergence
 from agv_analysis.scenario import load_scenario
 
 pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.analysis import analyse, observe
-from agv_analysis.convergence import wrapped
+from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.other_robots import RobotTopics, read_robot_run, read_topics
 from agv_analysis.recording import read_run
 from agv_analysis.run import Run

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.outages import age_statistics, ages, outage_lengths, outages
+from agv_analysis.metrics.outages import age_statistics, ages, outage_lengths, outages
 from agv_analysis.run import Run
 from agv_analysis.scenario import parse_scenario
 from agv_plant.parameters import ChannelParameters

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 from agv_analysis.cli import main
 from agv_analysis.commands.simulate import write_csv
-from agv_analysis.convergence import convergence
+from agv_analysis.metrics.convergence import convergence
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agv_analysis.convergence import convergence
-from agv_analysis.outages import outages
+from agv_analysis.metrics.convergence import convergence
+from agv_analysis.metrics.outages import outages
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate, simulate_batch

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_analysis.cli import main
-from agv_analysis.confidence import clopper_pearson
+from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.sweep.collect import collect

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.outages import outages
+from agv_analysis.metrics.outages import outages
 from agv_analysis.report.panels import LIMIT, OTHER, REFERENCE, Panel, age, distance, speed, track
 from agv_analysis.report.plotly import figure
 from agv_analysis.run import Run

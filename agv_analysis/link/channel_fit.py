@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.confidence import clopper_pearson
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
+from agv_analysis.metrics.confidence import clopper_pearson
 
 SIGNIFICANCE = 0.01
 """Independent losses are given up where verdicts as bursty as these would be rarer than this under them."""

@@ -17,7 +17,7 @@ import numpy as np
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.link.markov_channel import Chain, chain_of
-from agv_analysis.outages import LinkOutages, Steps, Verdicts, ages, link_outages
+from agv_analysis.metrics.outages import LinkOutages, Steps, Verdicts, ages, link_outages
 from agv_analysis.run import Floats
 from agv_analysis.simulation.on_air import blank, listen
 from agv_analysis.simulation.verdicts import Air

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from agv_analysis.convergence import convergence
+from agv_analysis.metrics.convergence import convergence
 from agv_analysis.reproduce import outdated, policies
 from agv_analysis.reproduce.claim import Values
 from agv_analysis.reproduce.claims import LIMITS, ON_TRACK

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from agv_analysis.convergence import Convergence, convergence
+from agv_analysis.metrics.convergence import Convergence, convergence
 from agv_analysis.run import Run
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_analysis.simulation.single import simulate

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from agv_analysis.outages import ages
+from agv_analysis.metrics.outages import ages
 from agv_analysis.run import LinkSlots
 from agv_analysis.simulation.on_air import Marks, Way, blank
 from agv_analysis.simulation.verdicts import Air, Verdicts, way_of

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.convergence import NEGLIGIBLE, SHARE, TOLERANCE
+from agv_analysis.metrics.convergence import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.control.plan import next_error
 from agv_cloud.staleness import ALIGN, PREDICT

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.confidence import clopper_pearson
+from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.run import Floats
 from agv_analysis.simulation.batch import Table
 from agv_analysis.sweep import METRICS
