@@ -17,7 +17,7 @@ import numpy as np
 
 from agv_analysis.analysis import analyse
 from agv_analysis.metrics.confidence import CONFIDENCE, clopper_pearson
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate

@@ -19,8 +19,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from agv_analysis.bag_writer import BagWriter, TopicInfo
-from agv_analysis.message_schema import schema_of
+from agv_analysis.bags.message_definitions import schema_of
+from agv_analysis.bags.writer import BagWriter, TopicInfo
 from agv_analysis.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import read_bag
 from agv_analysis.metrics.convergence import wrapped
-from agv_analysis.recording import TOPICS, loop_topics
+from agv_analysis.recordings.recording import TOPICS, loop_topics
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import answer, at_rest, received

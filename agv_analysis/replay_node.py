@@ -13,7 +13,7 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
-from agv_analysis.bag_writer import REPLAY_OF
+from agv_analysis.bags.writer import REPLAY_OF
 from agv_analysis.recorder_node import TOPICS, RecorderNode
 from agv_analysis.replay import EdgeInputs, Input
 from agv_ros.codec import Command, TrackingError, decode_command, decode_error, encode_clock

@@ -98,7 +98,7 @@ def drive(tmp_path: Path) -> Drive:
     """Run a params file of config/ with settings on DDS, record it, and give the run that its bag holds."""
 
     def run(*settings: str, config: str = "paper", executor: str = "events", bag: Path | None = None) -> Run:
-        from agv_analysis.recording import read_run
+        from agv_analysis.recordings.recording import read_run
         from agv_analysis.runner import run_in_process
         from agv_analysis.scenario import load_scenario
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from agv_analysis.bags.batch import Bytes
-from agv_analysis.bags.pages import PagesAhead
+from agv_analysis.bags.prefault import PagesAhead
 
 MIB = 2**20
 

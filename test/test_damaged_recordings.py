@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from agv_analysis.analysis import analyse
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 
 SAMPLE = Path(__file__).parents[1] / "bags/sample"

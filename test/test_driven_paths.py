@@ -22,7 +22,7 @@ from sensor_msgs.msg import TimeReference
 from agv_analysis.analysis import analyse
 from agv_analysis.parameters import RecorderParameters
 from agv_analysis.recorder_node import RecorderNode
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.replay import compare
 from agv_analysis.report.page import render
 from agv_analysis.run import Run

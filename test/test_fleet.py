@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from agv_analysis.fleet import Vehicle, instability, judge, vehicle_names, vehicle_scenarios
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.verdicts import Air

@@ -180,7 +180,7 @@ def test_an_agv_of_one_seed_is_the_same_whatever_else_is_off() -> None:
 
 def test_a_recording_without_the_truth_says_so(drive: Drive, tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
-    from agv_analysis.recording import read_run
+    from agv_analysis.recordings.recording import read_run
 
     run = drive("plant.duration=0.5", bag=tmp_path / "bag")
     assert (run.measured, run.notes) == (None, ())

@@ -586,7 +586,7 @@ def test_lockstep_names_the_missing_peer(start: Start, running: tuple[str, ...],
 
 @pytest.mark.parametrize("name", ["controller", "error_detector", "relay"])
 def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Start, tmp_path: Path, name: str) -> None:
-    from agv_analysis.recording import read_run
+    from agv_analysis.recordings.recording import read_run
 
     params = tmp_path / "params.yaml"
     params.write_text("plant: {ros__parameters: {duration: 10.0, answer_timeout: 60.0}}")

@@ -64,7 +64,7 @@ def test_executables_and_shared_files_lie_where_ros_looks_for_them(workspace: Pa
 
 def test_built_executables_run_a_lap_segment(workspace: Path, start: Callable[..., object], tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from agv_analysis.recording import read_run
+    from agv_analysis.recordings.recording import read_run
 
     prefix = workspace / "install/agv_ncs"
     site = next(prefix.glob("lib/python*/site-packages"))

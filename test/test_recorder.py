@@ -22,10 +22,10 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
-from agv_analysis.bag_writer import BagWriter, TopicInfo
-from agv_analysis.message_schema import schema_of
+from agv_analysis.bags.message_definitions import schema_of
+from agv_analysis.bags.writer import BagWriter, TopicInfo
 from agv_analysis.recorder_node import RecorderNode
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_plant.plant_node import PlantNode
 from agv_ros.errors import UserError

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from agv_analysis.metrics.convergence import wrapped
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.scenario import load_scenario
 from agv_ros.codec import DELAYED, DELIVERED, LOST, decode_slot, encode_slot
 from agv_ros.errors import UserError

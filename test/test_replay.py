@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from agv_analysis.bags import read_bag
-from agv_analysis.recording import read_run
+from agv_analysis.recordings.recording import read_run
 from agv_analysis.replay import (
     compare,
     compare_answers,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from agv_analysis.restarts import restarts
+from agv_analysis.recordings.restarts import restarts
 from agv_ros.stamps import NS_PER_S, Grid
 
 GRID = Grid(NS_PER_S, NS_PER_S // 200)

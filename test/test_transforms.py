@@ -23,7 +23,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from agv_analysis.other_robots import RobotTopics, read_robot_run
+from agv_analysis.recordings.other_robots import RobotTopics, read_robot_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_cloud.reference.reference import Reference

@@ -11,10 +11,10 @@ import numpy as np
 
 from agv_analysis.bags.batch import Bytes, Ints, numbers_at
 from agv_analysis.bags.checksum import crc32
+from agv_analysis.bags.chunk_index import survey
 from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
 from agv_analysis.bags.errors import DamagedError
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Index, Read, has_shape, is_known
-from agv_analysis.bags.survey import survey
 
 _HEAD = 8 + 8 + 8 + 4
 """Bytes of a chunk record before the name of its compression."""

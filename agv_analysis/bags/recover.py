@@ -13,7 +13,6 @@ import numpy as np
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from agv_analysis.bag_writer import TopicInfo, metadata_text, rosbag2_metadata
 from agv_analysis.bags.bag import Progress
 from agv_analysis.bags.batch import Batch, Layouts
 from agv_analysis.bags.errors import BagError, UndecodableError
@@ -22,6 +21,7 @@ from agv_analysis.bags.records import TYPE_HASH, Channel
 from agv_analysis.bags.rosbag2 import METADATA, locate, open_files
 from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import Storage
+from agv_analysis.bags.writer import TopicInfo, metadata_text, rosbag2_metadata
 
 
 class Recovery(NamedTuple):

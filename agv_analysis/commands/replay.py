@@ -46,7 +46,7 @@ def command(
       agv-ncs replay bags/first --again --set controller.kx=5.0
       agv-ncs replay bags/first --outages outages.csv
     """
-    from agv_analysis.recording import read_run
+    from agv_analysis.recordings.recording import read_run
     from agv_analysis.replay import compare as compare_run
     from agv_analysis.replay import with_settings, write_outages
     from agv_cloud.parameters import PATH
@@ -142,7 +142,7 @@ def _drive_again(run: Run, scenario: Scenario, ros: bool, json_file: Path | None
 def _on_dds(scenario: Scenario, bag: Path) -> Run:
     runner = _runner()
     from agv_analysis.progress import step_bar
-    from agv_analysis.recording import read_run
+    from agv_analysis.recordings.recording import read_run
 
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
         outcome = runner.run_in_process(scenario, bag, progress)

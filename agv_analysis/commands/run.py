@@ -79,7 +79,7 @@ def command(
 
 
 def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, processes: bool) -> None:
-    from agv_analysis.bag_writer import new_directory
+    from agv_analysis.bags.writer import new_directory
     from agv_analysis.fleet import to_json, vehicle_names, vehicle_scenarios
     from agv_analysis.progress import step_bar
     from agv_analysis.sweep.summary import write_rows

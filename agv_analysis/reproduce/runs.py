@@ -65,7 +65,7 @@ def recorded(folder: Path) -> Runs:
 
     Raises UserError if the folder exists or a run or its recording fails; ImportError where there is no ROS 2.
     """
-    from agv_analysis.recording import read_run
+    from agv_analysis.recordings.recording import read_run
     from agv_analysis.runner import run_in_process
 
     if folder.exists():

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis import restarts
-from agv_analysis.bag_writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.bags import Bag, read_bag
+from agv_analysis.bags.writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.metrics.convergence import body_errors, wrapped
+from agv_analysis.recordings import restarts
 from agv_analysis.run import Floats, LinkSlots, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.parameters import PATH

@@ -17,8 +17,8 @@ import numpy as np
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.metrics.outages import ages
-from agv_analysis.plans import read_reference
-from agv_analysis.posture_track import Steps, Track, by_the_clock_of, messages_of, read_poses, stamps_of
+from agv_analysis.recordings.posture_track import Steps, Track, by_the_clock_of, messages_of, read_poses, stamps_of
+from agv_analysis.recordings.robot_reference import read_reference
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.reference.reference import Reference

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
-from agv_analysis.posture_track import (
+from agv_analysis.recordings.posture_track import (
     Steps,
     Track,
     by_the_clock_of,
