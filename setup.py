@@ -78,7 +78,7 @@ setup(
             "relay = agv_plant.relay_node:main",
             "error_detector = agv_cloud.error_detector_node:main",
             "controller = agv_cloud.controller_node:main",
-            "recorder = agv_analysis.recorder_node:main",
+            "recorder = agv_analysis.runtime.recorder_node:main",
         ],
     },
 )

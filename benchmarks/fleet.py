@@ -12,7 +12,7 @@ import sys
 import threading
 from pathlib import Path
 
-from agv_analysis.fleet import vehicle_names, vehicle_scenarios
+from agv_analysis.runtime.fleet import vehicle_names, vehicle_scenarios
 from agv_analysis.scenario import load_scenario
 from benchmarks.comparison import Comparison
 
@@ -83,7 +83,7 @@ def run(count: int, first: int, number: int) -> int:
 
     Says when all of them run; the window begins with a line on standard input.
     """
-    from agv_analysis.runner import OneProcess, loop_of, run_loops
+    from agv_analysis.runtime.runner import OneProcess, loop_of, run_loops
     from agv_ros.executor import EXECUTORS, stop_on_signals
 
     scenario = load_scenario(CONFIG, ["plant.clock=realtime", "plant.duration=1000.0"])

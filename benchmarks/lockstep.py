@@ -72,8 +72,8 @@ def _against_echoes(where: str, rates: dict[str, float], recorder_shares_it: boo
 
 def _loop(steps: int, recorded: bool, processes: bool = False, executor: str = "events") -> float:
     """Steps per second of our loop."""
-    from agv_analysis.processes import run_in_processes
-    from agv_analysis.runner import run_in_process
+    from agv_analysis.runtime.processes import run_in_processes
+    from agv_analysis.runtime.runner import run_in_process
 
     scenario = load_scenario(CONFIG, [f"plant.duration={steps * 0.005}"])
     with tempfile.TemporaryDirectory() as folder:

@@ -60,8 +60,8 @@ def _loop() -> dict[str, float]:
     from mcap.reader import make_reader
     from rclpy.serialization import deserialize_message
 
-    from agv_analysis.recorder_node import TOPICS
-    from agv_analysis.runner import run_in_process
+    from agv_analysis.runtime.recorder_node import TOPICS
+    from agv_analysis.runtime.runner import run_in_process
 
     scenario = load_scenario(CONFIG, [f"plant.duration={SECONDS}", "plant.clock=realtime"])
     facts: dict[str, Any] = {}

@@ -99,7 +99,7 @@ def drive(tmp_path: Path) -> Drive:
 
     def run(*settings: str, config: str = "paper", executor: str = "events", bag: Path | None = None) -> Run:
         from agv_analysis.recordings.recording import read_run
-        from agv_analysis.runner import run_in_process
+        from agv_analysis.runtime.runner import run_in_process
         from agv_analysis.scenario import load_scenario
 
         where = tmp_path / "bag" if bag is None else bag

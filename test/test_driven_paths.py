@@ -20,13 +20,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import TimeReference
 
 from agv_analysis.analysis import analyse
-from agv_analysis.parameters import RecorderParameters
-from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.recordings.recording import read_run
-from agv_analysis.replay import compare
 from agv_analysis.report.page import render
 from agv_analysis.run import Run
-from agv_analysis.runner import NODES, OneProcess
+from agv_analysis.runtime.parameters import RecorderParameters
+from agv_analysis.runtime.recorder_node import RecorderNode
+from agv_analysis.runtime.replay import compare
+from agv_analysis.runtime.runner import NODES, OneProcess
 from agv_analysis.scenario import load_scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from agv_analysis.fleet import Vehicle, instability, judge, vehicle_names, vehicle_scenarios
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.runtime.fleet import Vehicle, instability, judge, vehicle_names, vehicle_scenarios
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.verdicts import Air
@@ -156,7 +156,7 @@ LOSSY = (*SHARED, "relay.downlink.model=bernoulli", "relay.downlink.p=0.2", "pla
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recordings of a fleet of three in one process."""
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from agv_analysis.runner import run_fleet
+    from agv_analysis.runtime.runner import run_fleet
 
     folder = tmp_path_factory.mktemp("fleet")
     outcomes = run_fleet(fleet_of(3, *LOSSY), folder, lambda _: None)
@@ -174,7 +174,7 @@ def test_a_vehicle_s_recording_is_its_simulation(driven: Path, name: str) -> Non
 
 
 def test_with_a_process_for_each_the_recordings_are_the_same_bytes(driven: Path, tmp_path: Path) -> None:
-    from agv_analysis.processes import run_fleet_in_processes
+    from agv_analysis.runtime.processes import run_fleet_in_processes
 
     outcomes = run_fleet_in_processes(fleet_of(3, *LOSSY), tmp_path, lambda _: None)
     assert [(found.steps, found.failure, found.recording_failure) for found in outcomes] == [(400, "", "")] * 3
@@ -183,7 +183,7 @@ def test_with_a_process_for_each_the_recordings_are_the_same_bytes(driven: Path,
 
 
 def test_a_vehicle_that_drives_alone_does_the_same(driven: Path, tmp_path: Path) -> None:
-    from agv_analysis.runner import run_fleet
+    from agv_analysis.runtime.runner import run_fleet
 
     run_fleet({"agv_02": fleet_of(3, *LOSSY)["agv_02"]}, tmp_path, lambda _: None)
     assert changed(driven / "agv_02", tmp_path / "agv_02", "/agv_02/") == []
@@ -191,7 +191,7 @@ def test_a_vehicle_that_drives_alone_does_the_same(driven: Path, tmp_path: Path)
 
 def test_a_vehicle_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from agv_analysis.runner import run_fleet
+    from agv_analysis.runtime.runner import run_fleet
 
     fleet = fleet_of(2, "plant.duration=1.0")
     late, impatient = fleet["agv_01"].error_detector, fleet["agv_01"].plant
@@ -272,7 +272,7 @@ def test_an_interrupted_fleet_leaves_readable_bags_and_nothing_else(
 def test_in_real_time_every_vehicle_keeps_its_steps(tmp_path: Path) -> None:
     """At a tenth of the usual rate, which a busy machine manages."""
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from agv_analysis.runner import run_fleet
+    from agv_analysis.runtime.runner import run_fleet
 
     settings = ("plant.clock=realtime", "plant.duration=2.0", "controller.kx=1.0")
     slow = [f"{node}.ts=0.05" for node in ("plant", "relay", "error_detector", "controller")]

@@ -19,7 +19,7 @@ LAYERS = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|(rosidl|ament|rmw|rosbag2|tf2|launch)(_.*)?")
 """Packages that there are on a machine with ROS only."""
 
-SPEAK_ROS = {"agv_ros.node", "agv_ros.executor", "agv_analysis.runner", "agv_analysis.processes"}
+SPEAK_ROS = {"agv_ros.node", "agv_ros.executor", "agv_analysis.runtime.runner", "agv_analysis.runtime.processes"}
 """Beside the nodes themselves."""
 
 
@@ -120,7 +120,7 @@ def test_everything_else_can_be_imported_where_there_is_no_ros() -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("module", ["agv_plant.plant_node", "agv_analysis.runner"])
+@pytest.mark.parametrize("module", ["agv_plant.plant_node", "agv_analysis.runtime.runner"])
 def test_that_process_has_no_ros_indeed(module: str) -> None:
     done = without_ros(module)
     assert done.returncode == 1

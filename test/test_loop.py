@@ -159,7 +159,7 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(drive: Drive, tmp_path: 
 
 
 def test_processes_give_the_same_bytes_as_one_process(drive: Drive, tmp_path: Path) -> None:
-    from agv_analysis.processes import run_in_processes
+    from agv_analysis.runtime.processes import run_in_processes
 
     settings = ("plant.duration=3.0",)
     drive(*settings, config="outages", bag=tmp_path / "one")

@@ -549,7 +549,7 @@ def test_in_real_time_the_agv_plays_its_plan_and_then_stands_still(bench: Bench)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("module", [*NODES, "agv_analysis.recorder_node"])
+@pytest.mark.parametrize("module", [*NODES, "agv_analysis.runtime.recorder_node"])
 def test_a_waiting_node_ends_cleanly_on_signals(
     start: Start, lone_bench: Bench, tmp_path: Path, module: str, number: int
 ) -> None:
@@ -592,7 +592,7 @@ def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Sta
     params.write_text("plant: {ros__parameters: {duration: 10.0, answer_timeout: 60.0}}")
     arguments = ["--ros-args", "--params-file", str(params), "-p", "wait_for_subscribers:=2"]
     bag = ["-p", f"bag:={tmp_path / 'bag'}", "-p", f"params_file:={params}", "-p", "stop_timeout:=30.0"]
-    recorder = start("agv_analysis.recorder_node", *arguments, *bag, "-p", "log_time:=stamp")
+    recorder = start("agv_analysis.runtime.recorder_node", *arguments, *bag, "-p", "log_time:=stamp")
     modules = {kind.rpartition(".")[2].removesuffix("_node"): kind for kind in NODES}
     running = {node: start(module, *arguments) for node, module in modules.items()}
     running["plant"].wait_for("step 500 of")

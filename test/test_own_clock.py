@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
-from agv_analysis.runner import run_in_process
+from agv_analysis.runtime.runner import run_in_process
 from agv_analysis.scenario import load_scenario
 from agv_ros.errors import UserError
 

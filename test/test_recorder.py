@@ -24,8 +24,8 @@ from rosgraph_msgs.msg import Clock
 
 from agv_analysis.bags.message_definitions import schema_of
 from agv_analysis.bags.writer import BagWriter, TopicInfo
-from agv_analysis.recorder_node import RecorderNode
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_plant.plant_node import PlantNode
 from agv_ros.errors import UserError

@@ -20,7 +20,8 @@ import yaml
 
 from agv_analysis.bags import read_bag
 from agv_analysis.recordings.recording import read_run
-from agv_analysis.replay import (
+from agv_analysis.run import Run
+from agv_analysis.runtime.replay import (
     compare,
     compare_answers,
     inputs_of,
@@ -30,7 +31,6 @@ from agv_analysis.replay import (
     with_settings,
     write_outages,
 )
-from agv_analysis.run import Run
 from agv_analysis.scenario import SCHEMAS
 from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import load_trace
@@ -267,8 +267,8 @@ def test_another_gain_in_the_nodes_is_another_gain_in_the_functions(
 @pytest.mark.parametrize("policy", ["align", "predict"])
 def test_policies_and_namespaces_on_dds(drive: Drive, policy: str, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from agv_analysis.replay_node import Pace
-    from agv_analysis.runner import replay_in_process
+    from agv_analysis.runtime.replay_node import Pace
+    from agv_analysis.runtime.runner import replay_in_process
 
     run = drive(f"error_detector.policy={policy}", "plant.duration=2.0", config="outages")
     inputs = read_inputs(Path(run.source), run.scenario.grid)._replace(namespace="robot7")
@@ -280,8 +280,8 @@ def test_policies_and_namespaces_on_dds(drive: Drive, policy: str, tmp_path: Pat
 def test_a_recording_that_begins_in_an_outage(sample: Run) -> None:
     """Its first slots name a pose that is not in it: no answer can be had, none is waited for."""
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    from agv_analysis.replay_node import Pace
-    from agv_analysis.runner import replay_in_process
+    from agv_analysis.runtime.replay_node import Pace
+    from agv_analysis.runtime.runner import replay_in_process
 
     first = int(np.flatnonzero(sample.lost)[0])
     whole = read_inputs(SAMPLE, sample.scenario.grid)

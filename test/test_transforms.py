@@ -110,7 +110,7 @@ def test_whoever_listens_gets_both_frames(of_another_type: None, prefix: str) ->
     from geometry_msgs.msg import PoseStamped, TransformStamped
     from rclpy.node import Node
 
-    from agv_analysis.runner import NODES, OneProcess
+    from agv_analysis.runtime.runner import NODES, OneProcess
     from agv_ros.executor import EXECUTORS, spin_for
     from agv_ros.node import LOOP_QOS
 
@@ -245,7 +245,7 @@ def test_without_tf2_msgs_the_nodes_run_and_say_so_once(
 def test_the_prefix_is_in_the_loop_s_own_messages(tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     from agv_analysis.bags import read_bag
-    from agv_analysis.runner import run_in_process
+    from agv_analysis.runtime.runner import run_in_process
 
     scenario = load_scenario(str(REPOSITORY / "config/paper.yaml"), ("plant.duration=0.5",))
     nodes = {

@@ -18,9 +18,9 @@ import rclpy
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from mcap.reader import make_reader
 
-from agv_analysis.processes import run_in_processes
 from agv_analysis.recordings.recording import read_run
-from agv_analysis.runner import run_in_process
+from agv_analysis.runtime.processes import run_in_processes
+from agv_analysis.runtime.runner import run_in_process
 from agv_analysis.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:

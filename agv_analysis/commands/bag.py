@@ -120,7 +120,7 @@ def _warn(problems: tuple[str, ...], is_complete: bool) -> None:
 @contextlib.contextmanager
 def _bar(bag: Path, what: str) -> Iterator[Callable[[int], None] | None]:
     """A progress bar in percent for bags that take long."""
-    from agv_analysis.progress import step_bar
+    from agv_analysis.commands.progress import step_bar
 
     files = [bag] if bag.is_file() else [file for file in bag.glob("*") if file.is_file()]
     if sum(file.stat().st_size for file in files) < _LONG:

@@ -16,7 +16,7 @@ def command() -> None:
 
 def markdown() -> str:
     """The parameters of all nodes as tables in Markdown, one for each node."""
-    from agv_analysis.parameters import RecorderParameters
+    from agv_analysis.runtime.parameters import RecorderParameters
     from agv_analysis.scenario import SCHEMAS
     from agv_ros.parameters import SHARED, parameters_of
 

@@ -11,8 +11,8 @@ import click
 from agv_analysis.commands import needs_ros, write_json
 
 if TYPE_CHECKING:
-    from agv_analysis.replay import Comparison, Difference
     from agv_analysis.run import Run
+    from agv_analysis.runtime.replay import Comparison, Difference
     from agv_analysis.scenario import Scenario
 
 
@@ -47,8 +47,8 @@ def command(
       agv-ncs replay bags/first --outages outages.csv
     """
     from agv_analysis.recordings.recording import read_run
-    from agv_analysis.replay import compare as compare_run
-    from agv_analysis.replay import with_settings, write_outages
+    from agv_analysis.runtime.replay import compare as compare_run
+    from agv_analysis.runtime.replay import with_settings, write_outages
     from agv_cloud.parameters import PATH
     from agv_ros.errors import UserError
 
@@ -88,7 +88,7 @@ def _check(is_wrong: bool, text: str) -> None:
 
 def _runner() -> Any:
     with needs_ros("; --compare and --again alone need none"):
-        from agv_analysis import runner
+        from agv_analysis.runtime import runner
     return runner
 
 
@@ -97,9 +97,9 @@ def _play(
     out: Path | None, compare: bool, json_file: Path | None,
 ) -> None:  # fmt: skip
     runner = _runner()
-    from agv_analysis.progress import step_bar
-    from agv_analysis.replay import compare_answers, on_steps, read_inputs
-    from agv_analysis.replay_node import Pace
+    from agv_analysis.commands.progress import step_bar
+    from agv_analysis.runtime.replay import compare_answers, on_steps, read_inputs
+    from agv_analysis.runtime.replay_node import Pace
 
     inputs = read_inputs(Path(run.source), scenario.grid, namespace)
     with step_bar(len(inputs.slots), "playing") as progress:
@@ -126,7 +126,7 @@ def _say(comparison: Comparison, json_file: Path | None) -> None:
 
 def _drive_again(run: Run, scenario: Scenario, ros: bool, json_file: Path | None) -> None:
     from agv_analysis.analysis import analyse
-    from agv_analysis.replay import with_outages_of
+    from agv_analysis.runtime.replay import with_outages_of
     from agv_analysis.simulation.single import simulate
     from agv_analysis.table import print_side_by_side
 
@@ -141,7 +141,7 @@ def _drive_again(run: Run, scenario: Scenario, ros: bool, json_file: Path | None
 
 def _on_dds(scenario: Scenario, bag: Path) -> Run:
     runner = _runner()
-    from agv_analysis.progress import step_bar
+    from agv_analysis.commands.progress import step_bar
     from agv_analysis.recordings.recording import read_run
 
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:

@@ -10,8 +10,8 @@ import click
 from agv_analysis.commands import needs_ros, with_settings, write_json
 
 if TYPE_CHECKING:
-    from agv_analysis.fleet import Vehicle
-    from agv_analysis.runner import Outcome
+    from agv_analysis.runtime.fleet import Vehicle
+    from agv_analysis.runtime.runner import Outcome
     from agv_analysis.scenario import Scenario
 
 PITCH = 20.0
@@ -64,9 +64,9 @@ def command(
         _run_fleet(scenario, fleet, pitch, bag, processes)
         return
     with needs_ros():
-        from agv_analysis.processes import run_in_processes
-        from agv_analysis.runner import run_in_process
-    from agv_analysis.progress import step_bar
+        from agv_analysis.runtime.processes import run_in_processes
+        from agv_analysis.runtime.runner import run_in_process
+    from agv_analysis.commands.progress import step_bar
 
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
         outcome = (run_in_processes if processes else run_in_process)(scenario, bag, progress)
@@ -80,14 +80,14 @@ def command(
 
 def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, processes: bool) -> None:
     from agv_analysis.bags.writer import new_directory
-    from agv_analysis.fleet import to_json, vehicle_names, vehicle_scenarios
-    from agv_analysis.progress import step_bar
+    from agv_analysis.commands.progress import step_bar
+    from agv_analysis.runtime.fleet import to_json, vehicle_names, vehicle_scenarios
     from agv_analysis.sweep.summary import write_rows
 
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
     with needs_ros():
-        from agv_analysis.processes import run_fleet_in_processes
-        from agv_analysis.runner import run_fleet
+        from agv_analysis.runtime.processes import run_fleet_in_processes
+        from agv_analysis.runtime.runner import run_fleet
     if bag is not None:
         with new_directory(bag):
             pass  # each vehicle's recorder goes on in it
@@ -112,8 +112,8 @@ def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, p
 
 def _judged(ended: dict[str, Outcome], bag: Path | None) -> list[Vehicle]:
     """Each vehicle by its recording, if there is one."""
-    from agv_analysis.fleet import Vehicle, judge
-    from agv_analysis.progress import step_bar
+    from agv_analysis.commands.progress import step_bar
+    from agv_analysis.runtime.fleet import Vehicle, judge
 
     vehicles = []
     with step_bar(len(ended), "judging") as progress:
@@ -132,7 +132,7 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from agv_analysis.fleet import instability
+    from agv_analysis.runtime.fleet import instability
 
     table = Table(box=None, pad_edge=False)
     table.add_column("AGV", no_wrap=True)

@@ -61,7 +61,7 @@ def command(
         --vary relay.uplink.p=0:0.95:20 --seeds 200 --out sweeps/gain
       (the same with --resume goes on where Ctrl-C stopped it)
     """
-    from agv_analysis.progress import step_bar
+    from agv_analysis.commands.progress import step_bar
     from agv_analysis.scenario import load_scenario
     from agv_analysis.sweep.collect import collect
     from agv_analysis.sweep.plan import Sweep, SweepError, parse_axis

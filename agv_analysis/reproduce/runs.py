@@ -66,7 +66,7 @@ def recorded(folder: Path) -> Runs:
     Raises UserError if the folder exists or a run or its recording fails; ImportError where there is no ROS 2.
     """
     from agv_analysis.recordings.recording import read_run
-    from agv_analysis.runner import run_in_process
+    from agv_analysis.runtime.runner import run_in_process
 
     if folder.exists():
         raise UserError(f"{folder}: exists already, with recordings of other runs: remove it or choose another --out")

@@ -21,7 +21,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_analysis.bags.message_definitions import schema_of
 from agv_analysis.bags.writer import BagWriter, TopicInfo
-from agv_analysis.parameters import RecorderParameters
+from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version
 from agv_ros.codec import PUBLISHED, stamp_of

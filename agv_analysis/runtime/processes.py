@@ -18,7 +18,7 @@ from typing import Any
 
 import click
 
-from agv_analysis.runner import (
+from agv_analysis.runtime.runner import (
     Outcome,
     Progress,
     Speedometer,
@@ -38,7 +38,7 @@ _MODULES = {
     "relay": "agv_plant.relay_node",
     "error_detector": "agv_cloud.error_detector_node",
     "controller": "agv_cloud.controller_node",
-    "recorder": "agv_analysis.recorder_node",
+    "recorder": "agv_analysis.runtime.recorder_node",
 }
 
 _STOP_TIMEOUT = 20.0
@@ -110,7 +110,7 @@ def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, prog
         try:
             for name, scenario in fleet.items():
                 params = files.enter_context(params_file(scenario))
-                command = [sys.executable, "-m", "agv_analysis.processes", name, str(params), str(bag or "")]
+                command = [sys.executable, "-m", "agv_analysis.runtime.processes", name, str(params), str(bag or "")]
                 vehicles.append(_Process(name, command))
             for vehicle in vehicles:
                 while vehicle.is_running(_LOOK_PERIOD) and not stop.requested:
