@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agv_analysis.explore.answer import answer
+from agv_analysis.explore.response import answer
 from agv_analysis.explore.settings import Values, scenario_of, values_of
 from agv_analysis.scenario import Scenario, load_scenario
 from benchmarks.comparison import Comparison

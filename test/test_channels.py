@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chisquare, norm
 
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_plant.channels import MODELS
 from agv_plant.channels.bernoulli import bernoulli
 from agv_plant.channels.burst import burst

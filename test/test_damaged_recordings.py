@@ -13,9 +13,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from agv_analysis.analysis import analyse
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
+from agv_analysis.stability.analysis import analyse
 
 SAMPLE = Path(__file__).parents[1] / "bags/sample"
 STEPS = 400

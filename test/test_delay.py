@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import kstest
 
-from agv_analysis.analysis import analyse
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.simulation.on_air import Marks, blank, listen
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.link_loop import Marks, blank, listen
+from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.margins import left_out
 from agv_analysis.stability.verdict import ASYMPTOTIC, UNKNOWN, UNSTABLE
 from agv_plant.parameters import ChannelParameters

@@ -19,7 +19,6 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import TimeReference
 
-from agv_analysis.analysis import analyse
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.page import render
 from agv_analysis.run import Run
@@ -28,6 +27,7 @@ from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.runtime.replay import compare
 from agv_analysis.runtime.runner import NODES, OneProcess
 from agv_analysis.scenario import load_scenario
+from agv_analysis.stability.analysis import analyse
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_cloud.parameters import ErrorDetectorParameters

@@ -19,13 +19,13 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from agv_analysis.analysis import analyse
-from agv_analysis.explore.answer import answer, told, under_the_outages_of
-from agv_analysis.explore.lap import Newest, lap_beside, lap_rows
+from agv_analysis.explore.background_criteria import Newest, lap_beside, lap_rows
+from agv_analysis.explore.response import answer, told, under_the_outages_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
 from agv_analysis.report.page import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_analysis.simulation.single import simulate
+from agv_analysis.stability.analysis import analyse
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def address(base: Scenario) -> Iterator[str]:
     import threading
 
     from agv_analysis.explore.app import HOST, build
-    from agv_analysis.explore.lap import Newest, lap_beside
+    from agv_analysis.explore.background_criteria import Newest, lap_beside
 
     pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
     from werkzeug.serving import make_server
@@ -271,7 +271,7 @@ def test_moving_a_slider_simulates_anew(page: Page) -> None:
 def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    from agv_analysis.margin_table import rows
+    from agv_analysis.report.margin_table import rows
     from agv_analysis.stability.margins import margins
 
     def expected(kx: float) -> dict[str, str]:

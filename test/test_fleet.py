@@ -19,7 +19,7 @@ from agv_analysis.recordings.recording import read_run
 from agv_analysis.runtime.fleet import Vehicle, instability, judge, vehicle_names, vehicle_scenarios
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, delay_draws, losses
 from agv_ros.parameters import ParameterError

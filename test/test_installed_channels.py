@@ -20,7 +20,7 @@ ARGUMENTS = (0.5, 20.0, 200.0)
 CHANNEL = ("--set", "relay.uplink.model=roadworks", "--set", "relay.uplink.arguments=[0.5, 20.0, 200.0]")
 
 SAME = """
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
 channel = ChannelParameters(model="roadworks", arguments=(0.5, 20.0, 200.0))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from agv_analysis.analysis import analyse
 from agv_analysis.metrics.convergence import convergence
 from agv_analysis.scenario import load_scenario
+from agv_analysis.stability.analysis import analyse
 
 pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 

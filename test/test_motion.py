@@ -15,7 +15,7 @@ from scipy.stats import chi2, kstest
 
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
-from agv_analysis.simulation.chance import normals
+from agv_analysis.simulation.noise import normals
 from agv_plant.parameters import PlantParameters
 from agv_plant.random_stream import normals_of
 from agv_plant.vehicle.motion import NOISE, SLIP, Body, Motion, body_of, move

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from agv_analysis.analysis import analyse, observe
 from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.recordings.other_robots import RobotTopics, read_robot_run, read_topics
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.analysis import analyse, observe
 from agv_ros.errors import UserError
 
 REPOSITORY = Path(__file__).parents[1]

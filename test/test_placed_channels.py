@@ -21,8 +21,8 @@ from agv_analysis.compiled import compiled
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.batch import TWIN_OFFSET
-from agv_analysis.simulation.on_air import blank, listen
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.link_loop import blank, listen
 from agv_plant.channels.coverage_hole import is_in_hole, rows_of
 from agv_plant.channels.position_dependent import PLACED
 from agv_plant.channels.rayleigh import SPEED_OF_LIGHT, fades_per_metre, fading_gain, loss_rate

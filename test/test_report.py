@@ -15,7 +15,6 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from agv_analysis.analysis import Analysis, analyse, observe
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.figures import draw_figures
 from agv_analysis.report.page import render, sentence, write_report
@@ -23,6 +22,7 @@ from agv_analysis.report.panels import LINE, Line, lifted_multipliers, panels, p
 from agv_analysis.report.sweep import sweep_figure, write_sweep_report
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
+from agv_analysis.stability.analysis import Analysis, analyse, observe
 from agv_analysis.sweep.plan import Sweep, parse_axis
 from agv_ros.errors import UserError
 

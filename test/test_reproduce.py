@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from agv_analysis.reproduce import outdated
+from agv_analysis.reproduce import constant_delay
 from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Finding, check
 from agv_analysis.reproduce.claims import CLAIMS, ON_TRACK
 from agv_analysis.reproduce.figures import figures, write

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from agv_analysis.cli import main
 from agv_analysis.link.markov_channel import chain_of
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, losses
 from agv_plant.radio.schedule import OUTAGE, is_scripted

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, losses
 from agv_plant.radio.shared_uplink import OLDEST_FIRST, RANDOM, ROUND_ROBIN, SCHEDULERS, serve_all

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import STATISTICS, simulate, simulate_batch
 from agv_analysis.simulation.batch import _Batch
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
 from agv_ros.errors import UserError

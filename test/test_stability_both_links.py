@@ -13,7 +13,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.run import Floats
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate_batch
-from agv_analysis.stability import both_links, mean_square
+from agv_analysis.stability import mean_square, mean_square_two_links
 from agv_analysis.stability.linearisation import HELD, Edge, seen, step_matrices
 from agv_analysis.stability.margins import margins
 from agv_cloud.parameters import ControllerParameters

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability.bursts import (
+from agv_analysis.stability.joint_spectral_radius import (
     STABLE,
     UNDECIDED,
     UNSTABLE,

@@ -8,12 +8,12 @@ import math
 import numpy as np
 import pytest
 
-from agv_analysis.analysis import analyse
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.floquet import drop_sequence
-from agv_analysis.stability.late import age_sequence
 from agv_analysis.stability.lifted import spectral_radius
+from agv_analysis.stability.variable_delay import age_sequence
 from agv_cloud.parameters import ControllerParameters
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses

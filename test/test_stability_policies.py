@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis.analysis import analyse
 from agv_analysis.link.markov_channel import bernoulli
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
-from agv_analysis.stability import bursts, floquet, mean_square
+from agv_analysis.stability import floquet, joint_spectral_radius, mean_square
+from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.linearisation import HELD, Edge, burst_maps, seen, step_matrices
 from agv_analysis.stability.margins import margins
 from agv_cloud.parameters import ControllerParameters

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation.channel_outcomes import Air
 from agv_analysis.simulation.single import simulate
-from agv_analysis.simulation.verdicts import Air
 from agv_plant.channels.trace import TraceError, load_trace, parse_json_trace, parse_trace, trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, losses

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis.analysis import Analysis, analyse
 from agv_analysis.link.channel_fit import fit_channel
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.analysis import Analysis, analyse
 from agv_analysis.stability.verdict import judge
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from agv_analysis.analysis import Observations
+    from agv_analysis.stability.analysis import Observations
 
 F = TypeVar("F", bound=Callable[..., Any])
 

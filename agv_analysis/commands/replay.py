@@ -125,10 +125,10 @@ def _say(comparison: Comparison, json_file: Path | None) -> None:
 
 
 def _drive_again(run: Run, scenario: Scenario, ros: bool, json_file: Path | None) -> None:
-    from agv_analysis.analysis import analyse
+    from agv_analysis.report.table import print_side_by_side
     from agv_analysis.runtime.replay import with_outages_of
     from agv_analysis.simulation.single import simulate
-    from agv_analysis.table import print_side_by_side
+    from agv_analysis.stability.analysis import analyse
 
     with tempfile.TemporaryDirectory(prefix="agv_ncs_") as folder:
         scenario = with_outages_of(run, scenario, Path(folder))

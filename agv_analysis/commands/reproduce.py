@@ -29,7 +29,7 @@ def command(out: Path, ros: bool) -> None:
     """
     from rich.console import Console
 
-    from agv_analysis.reproduce import dots, report
+    from agv_analysis.reproduce import dot_plot, report
     from agv_analysis.reproduce.claim import check
     from agv_analysis.reproduce.claims import CLAIMS
     from agv_analysis.reproduce.figures import figures, write

@@ -39,10 +39,10 @@ def command(
       agv-ncs simulate config/outages.yaml --set controller.kx=250.0 --set relay.seed=7 --json fast.json
       agv-ncs simulate config/paper.yaml --set error_detector.track=eight --csv eight.csv
     """
-    from agv_analysis.analysis import analyse
+    from agv_analysis.report.table import print_table
     from agv_analysis.scenario import load_scenario
     from agv_analysis.simulation.single import simulate
-    from agv_analysis.table import print_table
+    from agv_analysis.stability.analysis import analyse
 
     run = simulate(load_scenario(params, settings))
     analysis = analyse(run)

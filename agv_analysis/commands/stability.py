@@ -58,7 +58,7 @@ def command(
     from rich.markup import escape
     from rich.table import Table
 
-    from agv_analysis.margin_table import rows
+    from agv_analysis.report.margin_table import rows
     from agv_analysis.scenario import load_scenario
     from agv_analysis.stability.margins import margins
 

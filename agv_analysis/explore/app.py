@@ -7,8 +7,8 @@ import signal
 from collections.abc import Callable
 from typing import Any
 
-from agv_analysis.explore.answer import answer
-from agv_analysis.explore.lap import Newest, lap_beside
+from agv_analysis.explore.background_criteria import Newest, lap_beside
+from agv_analysis.explore.response import answer
 from agv_analysis.explore.settings import CHOICES, PRESETS, SLIDERS, preset_values, scenario_of, values_of
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError

@@ -19,8 +19,8 @@ from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.link.markov_channel import Chain, chain_of
 from agv_analysis.metrics.outages import LinkOutages, Steps, Verdicts, ages, link_outages
 from agv_analysis.run import Floats
-from agv_analysis.simulation.on_air import blank, listen
-from agv_analysis.simulation.verdicts import Air
+from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.link_loop import blank, listen
 from agv_plant.channels.rayleigh import fades_per_metre, loss_rate
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
@@ -173,7 +173,7 @@ def draw(path: Path, found: ChannelStudy) -> None:
     """Draw the age slot by slot, and its distribution beside the closed form. Raises UserError if that fails."""
     from matplotlib.figure import Figure
 
-    from agv_analysis.picture import DRIVEN, LOST
+    from agv_analysis.report.picture import DRIVEN, LOST
 
     figure = Figure(figsize=(11.0, 4.0), layout="constrained")
     course, shares = figure.subplots(1, 2)

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
 from agv_analysis.run import Run
 from agv_analysis.simulation.reference import reference_of
+from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 from agv_analysis.version import version
 from agv_ros.errors import UserError
@@ -168,7 +168,7 @@ def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     """The figures that the terminal shows, without its colours."""
     from rich.text import Text
 
-    from agv_analysis.table import rows
+    from agv_analysis.report.table import rows
 
     for name, value in rows(analysis):
         yield name, Text.from_markup(value).plain
@@ -179,7 +179,7 @@ def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
     if not isinstance(analysis, Analysis):
         yield "Margins", f"not computed: {GAINS_UNKNOWN}"
         return
-    from agv_analysis.margin_table import margin_rows
+    from agv_analysis.report.margin_table import margin_rows
 
     try:
         if _drives_its_track(analysis.run):

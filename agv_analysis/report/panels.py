@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.analysis import Analysis, Observations, paper_inputs
 from agv_analysis.metrics.convergence import TOLERANCE, body_errors, wrapped
-from agv_analysis.picture import SMALLEST, within
+from agv_analysis.report.picture import SMALLEST, within
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import lifted, paper
+from agv_analysis.stability.analysis import Analysis, Observations, paper_inputs
 from agv_analysis.stability.linearisation import step_matrices
 
 TIME = "time [s]"

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from agv_analysis.metrics.convergence import SHARE, settling, sign_changes
-from agv_analysis.reproduce import outdated
+from agv_analysis.reproduce import constant_delay
 from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Claim, Judgement, Values, holds_if
 from agv_analysis.reproduce.runs import GAINS, LIMIT, Runs, gain, scenario
 from agv_analysis.run import Floats, Run

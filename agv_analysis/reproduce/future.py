@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from agv_analysis.metrics.convergence import convergence
-from agv_analysis.reproduce import outdated, policies
+from agv_analysis.reproduce import constant_delay, policies
 from agv_analysis.reproduce.claim import Values
 from agv_analysis.reproduce.claims import LIMITS, ON_TRACK
 from agv_analysis.reproduce.policies import CLOSER, SEEDS
@@ -22,7 +22,7 @@ from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.single import steps_of
-from agv_analysis.stability import bursts, lifted, mean_square, paper
+from agv_analysis.stability import joint_spectral_radius, lifted, mean_square, paper
 
 TO_1_CM = "to 1 cm [steps]"
 SHARE_OF_K_THETA = "K_y / K_theta^2"

@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.analysis import analyse
 from agv_analysis.metrics.confidence import CONFIDENCE, clopper_pearson
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.batch import TWIN_OFFSET
+from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.empirical import distances
 from agv_plant.channels.registry import SHARED
 from agv_plant.parameters import ChannelParameters

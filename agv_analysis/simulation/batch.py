@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.link_loop import Marks, blank, contraction_on_air, statistics_on_air
 from agv_analysis.simulation.loop import (
     Case,
     Statistics,
@@ -24,10 +26,8 @@ from agv_analysis.simulation.loop import (
     statistics_of_twins,
     statistics_of_two,
 )
-from agv_analysis.simulation.on_air import Marks, blank, contraction_on_air, statistics_on_air
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.single import settings_of, steps_of
-from agv_analysis.simulation.verdicts import Air
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
 

@@ -9,11 +9,11 @@ import numpy as np
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.chance import measurements, normals
-from agv_analysis.simulation.link import SimulatedLink
+from agv_analysis.simulation.link_loop import history_on_air
 from agv_analysis.simulation.loop import Case, Rows, Settings, at_rest, history
-from agv_analysis.simulation.on_air import history_on_air
+from agv_analysis.simulation.noise import measurements, normals
 from agv_analysis.simulation.reference import reference_of
+from agv_analysis.simulation.simulated_link import SimulatedLink
 from agv_cloud.staleness import POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.parameters import PlantParameters

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.stability.bursts import largest_n_across, largest_n_along
+from agv_analysis.stability.joint_spectral_radius import largest_n_across, largest_n_along
 from agv_analysis.stability.lifted import critical_delay_across, critical_delay_along, radii_of
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference.reference import Reference, lap_steps

@@ -12,7 +12,15 @@ from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.reference import reference_of
-from agv_analysis.stability import almost_sure, both_links, bursts, floquet, lifted, mean_square, paper
+from agv_analysis.stability import (
+    almost_sure,
+    floquet,
+    joint_spectral_radius,
+    lifted,
+    mean_square,
+    mean_square_two_links,
+    paper,
+)
 from agv_analysis.stability.linearisation import HELD, Edge
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference.reference import lap_steps

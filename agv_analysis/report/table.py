@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 
-from agv_analysis.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.metrics.outages import loss_causes
+from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 
 
 def print_table(analysis: Observations) -> None:

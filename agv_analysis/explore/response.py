@@ -15,7 +15,7 @@ from agv_analysis.report.plotly import figure
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
-from agv_analysis.stability import bursts, lifted, mean_square, paper
+from agv_analysis.stability import joint_spectral_radius, lifted, mean_square, paper
 from agv_analysis.stability.margins import binding
 from agv_ros.parameters import SHARED
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from agv_analysis.metrics.outages import ages
 from agv_analysis.run import LinkSlots
-from agv_analysis.simulation.on_air import Marks, Way, blank
-from agv_analysis.simulation.verdicts import Air, Verdicts, way_of
+from agv_analysis.simulation.channel_outcomes import Air, Verdicts, way_of
+from agv_analysis.simulation.link_loop import Marks, Way, blank
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, draws
 

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled, compiled_with, numbers
-from agv_analysis.simulation.chance import normals
-from agv_analysis.simulation.on_air import Way
+from agv_analysis.simulation.link_loop import Way
+from agv_analysis.simulation.noise import normals
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.position_dependent import kind_of
 from agv_plant.channels.registry import SHARED, TRACE, find_model

@@ -11,8 +11,16 @@ from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.metrics.convergence import Convergence, convergence
 from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Floats, LinkSlots, Run
-from agv_analysis.stability import both_links, bursts, floquet, late, lifted, mean_square, paper
-from agv_analysis.stability.bursts import BurstVerdict
+from agv_analysis.stability import (
+    floquet,
+    joint_spectral_radius,
+    lifted,
+    mean_square,
+    mean_square_two_links,
+    paper,
+    variable_delay,
+)
+from agv_analysis.stability.joint_spectral_radius import BurstVerdict
 from agv_analysis.stability.linearisation import Edge
 from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED
 from agv_analysis.stability.verdict import Verdict, judge, judge_both_links, judge_late

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from multiprocessing import resource_tracker
 from typing import Any, Generic, TypeVar
 
-from agv_analysis.explore.answer import under_the_outages_of
+from agv_analysis.explore.response import under_the_outages_of
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -33,10 +33,10 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
 
     What cannot be simulated has no rows: the page says why at once.
     """
-    from agv_analysis.analysis import analyse
-    from agv_analysis.margin_table import margin_rows
+    from agv_analysis.report.margin_table import margin_rows
     from agv_analysis.report.page import sentence
     from agv_analysis.simulation.single import simulate
+    from agv_analysis.stability.analysis import analyse
 
     try:
         analysis = analyse(simulate(scenario))
