@@ -49,7 +49,7 @@ def command(out: Path, ros: bool) -> None:
     with Console(stderr=True).status("simulating its future work ..."):
         found = list(tables())
         for table in found:
-            dots.write(table, out)
+            dot_plot.write(table, out)
     for table in found:
         report.print_table(table)
     report.write(findings, found, "recorded runs" if ros else "simulation", out)

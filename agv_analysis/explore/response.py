@@ -93,7 +93,10 @@ def told(run: Run) -> Iterator[tuple[str, str]]:
         radius = lifted.largest_radius(n, v[some], w[some], gains, ts)
         yield "Pose always that old", f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
     top = float(np.abs(v).max())
-    along, across = bursts.largest_n_along(ts * gains.kx), bursts.largest_n_across(top, gains, ts)
+    along, across = (
+        joint_spectral_radius.largest_n_along(ts * gains.kx),
+        joint_spectral_radius.largest_n_across(top, gains, ts),
+    )
     yield "Straight track, any outages", f"up to {_n(along)} along, {_n(across)} across{but}"
     delay = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(top, gains, ts))
     yield "Straight track, delay", f"below {delay * ts * 1e3:.4g} ms{but}" if delay > 0.0 else "none"

@@ -100,9 +100,9 @@ def _outage_test(runs: Runs) -> Values:
     return {
         "line, 0 outages: |lambda|": _radius_on_line(MIDDLE, 0),
         f"line, {old} outages: |lambda|": _radius_on_line(MIDDLE, old),
-        f"pose {old} steps old: error after 4000 steps [m]": outdated.final_error(long, old),
-        f"pose {old} steps old: twins after 1000": outdated.contraction(short, old),
-        f"pose {old - 1} steps old: twins after 1000": outdated.contraction(short, old - 1),
+        f"pose {old} steps old: error after 4000 steps [m]": constant_delay.final_error(long, old),
+        f"pose {old} steps old: twins after 1000": constant_delay.contraction(short, old),
+        f"pose {old - 1} steps old: twins after 1000": constant_delay.contraction(short, old - 1),
     }
 
 

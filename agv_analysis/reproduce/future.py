@@ -198,14 +198,14 @@ def _criteria_at(track: str, kx: float) -> Values:
     theta, v_r, w_r = reference[:, 2], reference[:, 3], reference[:, 4]
     gains, ts = wanted.controller, wanted.plant.ts
     n_paper = paper.largest_n(theta, v_r, gains, ts)
-    n_bursts, _ = bursts.largest_n(v_r, w_r, gains, ts)
+    n_bursts, _ = joint_spectral_radius.largest_n(v_r, w_r, gains, ts)
     n_constant = lifted.largest_n(v_r, w_r, gains, ts)
     return {
         "track": track,
         "K_x [1/s]": kx,
         "paper's test": "any" if n_paper is None else n_paper,
         "constant n": n_constant,
-        "constant n, twins": _largest(lambda n: outdated.contraction(wanted, n) < CLOSER, n_constant or 0),
+        "constant n, twins": _largest(lambda n: constant_delay.contraction(wanted, n) < CLOSER, n_constant or 0),
         "bursts": n_bursts,
         "bursts, twins": _largest(lambda n: _contracts(*burst, f"relay.uplink.n={n}"), n_bursts or 0),
         "independent losses, mean square": mean_square.critical_loss(v_r, w_r, gains, ts),

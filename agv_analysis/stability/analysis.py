@@ -134,7 +134,7 @@ class Analysis(Observations):
     @property
     def bursts_stable(self) -> bool:
         """Is the loop proved to contract for every sequence of outages no longer than the longest of the run?"""
-        return self.bursts.verdict == bursts.STABLE
+        return self.bursts.verdict == joint_spectral_radius.STABLE
 
     def disagreements(self) -> list[str]:
         """A sentence for each pair of criteria that say different things."""
@@ -145,7 +145,7 @@ class Analysis(Observations):
                 f"error grow by a factor {self.lifted_radius:.4f} a step: the test takes the outdated pose for the "
                 "current one"
             )
-        if self.paper.stable and self.bursts.verdict == bursts.UNSTABLE:
+        if self.paper.stable and self.bursts.verdict == joint_spectral_radius.UNSTABLE:
             found.append(
                 f"the paper's test calls the loop stable, but outages of {self.bursts.worst} slots in a row, again and "
                 f"again, make the error grow by a factor {self.bursts.lower:.4f} a step"
@@ -211,7 +211,7 @@ def analyse(run: Run) -> Analysis:
         verdict = judge_both_links(both, run.scenario.plant.downlink_policy, gains.v_max)
     else:
         longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
-        n_bursts, _ = bursts.largest_n(v_r, w_r, gains, run.ts, longest, edge)
+        n_bursts, _ = joint_spectral_radius.largest_n(v_r, w_r, gains, run.ts, longest, edge)
         verdict = judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max)
     return Analysis(
         run=run,
@@ -219,7 +219,7 @@ def analyse(run: Run) -> Analysis:
         convergence=convergence(run),
         paper=paper_test(run),
         lifted_radius=radius,
-        bursts=bursts.verdict(out.n_ul_max, v_r, w_r, gains, run.ts, edge),
+        bursts=joint_spectral_radius.verdict(out.n_ul_max, v_r, w_r, gains, run.ts, edge),
         fit=fit,
         mean_square_growth=growth,
         floquet=of_drops,
@@ -231,11 +231,11 @@ def analyse(run: Run) -> Analysis:
 def _growth_on_both_links(run: Run, fit: ChannelFit, edge: Edge) -> float | None:
     """Growth of E[e^2] per step under both fitted channels; None if no command was lost, or for other policies."""
     policy = run.scenario.plant.downlink_policy
-    if policy not in both_links.POLICIES or not run.downlink_lost.any():
+    if policy not in mean_square_two_links.POLICIES or not run.downlink_lost.any():
         return None
     down = fit_channel(run.downlink_lost).chain
     speeds = run.reference[:, 3], run.reference[:, 4]
-    growth = both_links.lap_growth(
+    growth = mean_square_two_links.lap_growth(
         *speeds, run.scenario.controller, run.ts, fit.chain, down, edge, stops=policy == "zero"
     )
     return growth / len(run)
@@ -298,7 +298,7 @@ def _late_contraction(run: Run, edge: Edge) -> float | None:
     if edge.predicts or not is_whole or _has_late(run.downlink):
         return None
     with np.errstate(all="ignore"):
-        growth = late.age_sequence(
+        growth = variable_delay.age_sequence(
             run.n_ul, run.reference[:, 3], run.reference[:, 4], run.scenario.controller, run.ts, edge
         )
     return _finite(float(np.exp(growth / len(run))))

@@ -156,7 +156,7 @@ def margins(scenario: Scenario) -> Margins:
     true = edge.felt(gains)
     n_lifted = _largest_constant_delay(v_r, w_r, gains, ts, edge, reasons)
     longest = LONGEST_PREDICTED if edge.predicts else LONGEST
-    n_bursts, refuted = bursts.largest_n(v_r, w_r, gains, ts, longest, edge)
+    n_bursts, refuted = joint_spectral_radius.largest_n(v_r, w_r, gains, ts, longest, edge)
     if n_bursts is None:
         reasons["n_max.bursts"] = f"no bound: every burst that was tried contracts, up to {longest} slots"
     elif refuted is not None and refuted > n_bursts + 1:
@@ -232,8 +232,8 @@ def _binding_of(edge: Edge, n_bursts: int | None, v: float, gains: ControllerPar
 
 def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
     """Which error bursts blow up first at the speed `v` [m/s]: along or across the track; None if neither ever."""
-    along = bursts.largest_n_along(ts * gains.kx)
-    across = bursts.largest_n_across(v, gains, ts)
+    along = joint_spectral_radius.largest_n_along(ts * gains.kx)
+    across = joint_spectral_radius.largest_n_across(v, gains, ts)
     if along is None and across is None:
         return None
     if across is None or (along is not None and along <= across):
@@ -291,12 +291,12 @@ def _both_links(scenario: Scenario, v_r: Floats, w_r: Floats, edge: Edge, reason
         reasons[name] = "the downlink loses nothing"
     elif uplink is None or downlink is None:
         reasons[name] = "no answer: a channel is no finite Markov chain"
-    elif policy not in both_links.POLICIES:
+    elif policy not in mean_square_two_links.POLICIES:
         reasons[name] = f"no answer: computed for a plant that holds its command or stops, not for {policy}"
     elif scenario.relay.downlink.correlation != 0.0:
         reasons[name] = "no answer: computed for links that lose independently of each other"
     else:
-        growth = both_links.lap_growth(
+        growth = mean_square_two_links.lap_growth(
             v_r, w_r, scenario.controller, scenario.plant.ts, uplink, downlink, edge, policy == "zero"
         )
         return growth / len(v_r)

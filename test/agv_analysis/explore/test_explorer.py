@@ -1,0 +1,432 @@
+"""The explorer: its page moved in headless Chromium as a person would, its answers against simulation and theory."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import re
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from http.client import HTTPException
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+
+from agv_analysis.explore.background_criteria import Newest, lap_beside, lap_rows
+from agv_analysis.explore.response import answer, told, under_the_outages_of
+from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
+from agv_analysis.report.page import sentence
+from agv_analysis.scenario import load_scenario, parse_scenario
+from agv_analysis.simulation.single import simulate
+from agv_analysis.stability.analysis import analyse
+from agv_ros.parameters import ParameterError
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+    from agv_analysis.scenario import Scenario
+    from test.conftest import Start
+
+REPOSITORY = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def base() -> Scenario:
+    return load_scenario(str(REPOSITORY / "config/outages.yaml"))
+
+
+def test_a_page_that_nobody_has_touched_is_the_scenario_of_the_file(base: Scenario) -> None:
+    assert settings_of(base, values_of(base)) == []
+    assert scenario_of(base, values_of(base)) == base
+
+
+def test_what_a_slider_says_arrives_in_the_scenario(base: Scenario) -> None:
+    moved = {
+        "kx": 40,
+        "ts": 10,
+        "v_max": 6,
+        "ahead": 1.5,
+        "left": -0.5,
+        "n": 3,
+        "seed": 9,
+        "track": "eight",
+        "delay": 30,
+    }
+    found = scenario_of(base, {**values_of(base), **moved, "more": " plant.duration=50\n\nplant.integration=arc"})
+    assert (found.controller.kx, found.plant.ts, found.controller.v_max) == (40.0, 0.01, 6.0)
+    # the track starts northwards: ahead is y, left is -x
+    np.testing.assert_allclose(found.plant.initial_pose[:2], (0.5, 1.5), atol=1e-12)
+    assert (found.relay.uplink.n, found.relay.seed, found.error_detector.track) == (3, 9, "eight")
+    assert found.relay.uplink.delay == 0.03
+    assert (found.plant.duration, found.plant.integration) == (50.0, "arc")
+    again = {key: value for key, value in values_of(found).items() if key in moved}
+    assert again == pytest.approx({k: v for k, v in moved.items() if k != "track"} | {"track": "eight"})
+
+
+@pytest.mark.parametrize("more", ["controller.kx=-1.0", "plant.color=red", "relay.uplink.model=trace", "nonsense"])
+def test_what_is_not_allowed_is_refused_with_the_reason(base: Scenario, more: str) -> None:
+    with pytest.raises(ParameterError):
+        scenario_of(base, {**values_of(base), "more": more})
+
+
+def test_the_pinned_setting_meets_the_same_outages(base: Scenario) -> None:
+    pinned = scenario_of(base, {**values_of(base), "kx": 5, "model": "perfect", "seed": 3})
+    now = scenario_of(base, {**values_of(base), "kx": 40, "seed": 8})
+    runs = simulate(now), simulate(under_the_outages_of(pinned, now))
+    np.testing.assert_array_equal(runs[0].lost, runs[1].lost)
+    assert runs[0].lost.any()
+    assert runs[1].scenario.controller == pinned.controller
+    slower = scenario_of(base, {**values_of(base), "ts": 10})
+    assert simulate(under_the_outages_of(slower, now)).ts == 0.01
+
+
+def test_both_runs_are_drawn(base: Scenario) -> None:
+    found = answer(base, dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0)))
+    assert [trace["name"] for trace in found.track["data"]] == ["reference", "AGV", "pose lost", "pinned"]
+    assert [trace["name"] for trace in found.time["data"]].count("pinned") == 3
+    assert all(len(row) == 3 and row[2] for row in found.rows)
+    assert all(trace["type"] == "scatter" for trace in found.time["data"])
+
+
+def test_a_pinned_setting_has_margins_of_its_own_under_the_same_outages(base: Scenario) -> None:
+    slow = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0))
+    both = {name: (value, other) for name, value, other in lap_beside(base, slow)}
+    assert both["Pose always n steps old"] == ("12 steps (60 ms)", "62 steps (310 ms)")
+    assert both["Any outages up to n"] == ("14 steps (70 ms)", "78 steps (390 ms)")
+    alone = lap_rows(slow)
+    assert {name: other for name, (_, other) in both.items()} == dict(alone)
+
+
+def test_the_losses_of_a_run_are_judged_as_the_analysis_does(base: Scenario) -> None:
+    found = dict(lap_rows(base))
+    analysis = analyse(simulate(base))
+    assert found["Verdict"] == sentence(analysis)
+    assert found["These very losses"] == f"stable, an error grows by a factor {analysis.floquet:.6g} a step"
+
+
+def test_of_calls_that_wait_only_the_newest_is_made(tmp_path: Path) -> None:
+    pipe, file = tmp_path / "pipe", tmp_path / "file"
+    os.mkfifo(pipe)
+    file.write_text("later")
+    newest: Newest[str] = Newest(Path.read_text)
+    try:
+        with ThreadPoolExecutor(3) as threads:
+            first = threads.submit(newest, pipe)
+            with pipe.open("w") as writer:  # opens once it is read from: the first call has its turn
+                others = [threads.submit(newest, file) for _ in range(2)]
+                done, _ = wait(others, timeout=60.0, return_when=FIRST_COMPLETED)
+                assert [call.result() for call in done] == [None]  # without waiting for the first
+                writer.write("first")
+            assert first.result(60.0) == "first"
+            assert {call.result(60.0) for call in others} == {None, "later"}
+    finally:
+        newest.close()
+
+
+def test_a_call_waits_whether_a_newer_one_comes(tmp_path: Path) -> None:
+    newest: Newest[str] = Newest(Path.read_text, rest=600.0)
+    with ThreadPoolExecutor(2) as threads:
+        calls = [threads.submit(newest, tmp_path / "file") for _ in range(2)]  # there is no such file
+        done, waits = wait(calls, timeout=60.0, return_when=FIRST_COMPLETED)
+        assert [call.result() for call in done] == [None]
+        newest.close()
+        assert [call.result(60.0) for call in waits] == [None]
+
+
+def test_the_presets_tell_the_story(base: Scenario) -> None:
+    def late(key: str) -> tuple[float, str]:
+        run = simulate(scenario_of(base, preset_values(base, key)))
+        distance = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
+        return float(distance[-1]), dict(told(run))["Paper's test"]
+
+    assert list(PRESETS) == ["paper", "missed", "predicted"]
+    assert late("paper")[0] < 1e-6
+    error, paper = late("missed")
+    assert paper == "holds for any number of outages"
+    assert error > 1e3
+    assert late("predicted")[0] < 1e-6
+
+
+def test_a_preset_undoes_what_the_file_says_of_radio_and_agv(base: Scenario) -> None:
+    """Whatever the page was started with, a preset shows what its text says, and the page shows what it took."""
+    worse = [
+        "relay.uplink.jitter=0.05", "relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "plant.lag=0.2",
+        "relay.uplink.schedule=10: outage=3", "relay.uplink.lifetime=0.05", "plant.speed_scale=0.8",
+    ]  # fmt: skip
+    spoilt = base.with_settings([*worse, "plant.duration=50.0"], "test")
+    for key in PRESETS:
+        values, expected = preset_values(spoilt, key), scenario_of(base, preset_values(base, key))
+        assert len(values["more"].splitlines()) == len(worse)
+        found = scenario_of(spoilt, values)
+        assert found == dataclasses.replace(expected, plant=dataclasses.replace(expected.plant, duration=50.0))
+
+
+def test_the_counterexample_is_a_pose_that_is_always_as_old(base: Scenario) -> None:
+    scenario = scenario_of(base, preset_values(base, "missed"))
+    run = simulate(scenario)
+    assert set(run.n_ul[20:].tolist()) == {13}
+    assert not run.lost.any()
+    # the eigenvalues that the preset's text names, of the closed loop with a fresh pose: 1 - a, and (eq. 55) with
+    # b = T_s v K_theta, c = T_s^2 v^2 K_y the roots of mu^2 - b mu + c, of which they are 1 - mu
+    gains, v = scenario.controller, run.reference[-1, 3]
+    b, c = 0.005 * v * gains.ktheta, (0.005 * v) ** 2 * gains.ky
+    found = [1.0 - 0.005 * gains.kx, *(1.0 - np.roots([1.0, -b, c]))]
+    np.testing.assert_allclose(found, [0.875, 0.995, 0.995], atol=1e-6)
+    # a recursion of its own along the track: e(k+1) = e(k) - a e(k-13)
+    e = [-5.0] * 14
+    for _ in range(400):
+        e.append(e[-1] - 0.125 * e[-14])
+    assert max(map(abs, e[-60:])) > max(map(abs, e[100:160]))
+
+
+# -- in the browser ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def address(base: Scenario) -> Iterator[str]:
+    """The explorer, served by this process."""
+    import threading
+
+    from agv_analysis.explore.app import HOST, build
+    from agv_analysis.explore.background_criteria import Newest, lap_beside
+
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    from werkzeug.serving import make_server
+
+    lap = Newest(lap_beside)
+    server = make_server(HOST, 0, build(base, lap).server, threaded=True)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    yield f"http://{HOST}:{server.server_port}/"
+    server.shutdown()
+    thread.join()
+    lap.close()
+    server.server_close()
+
+
+class Page:
+    """The page as a person has it before them."""
+
+    def __init__(self, chrome: Chrome) -> None:
+        self.chrome = chrome
+
+    def text(self, name: str) -> str:
+        return self.chrome.find_element("id", name).text
+
+    def until(self, condition: Callable[[], Any]) -> None:
+        from selenium.common.exceptions import StaleElementReferenceException
+        from selenium.webdriver.support.ui import WebDriverWait
+
+        ignored = [StaleElementReferenceException]
+        WebDriverWait(self.chrome, 300.0, 0.05, ignored_exceptions=ignored).until(lambda _: condition())
+
+    def click(self, name: str) -> None:
+        self.chrome.execute_script("arguments[0].click()", self.chrome.find_element("id", name))
+
+    def slider(self, name: str) -> Any:
+        return self.chrome.find_element("css selector", f"#{name} [role=slider]")
+
+    def names(self, plot: str) -> list[str]:
+        script = f"return document.querySelector('#plot-{plot} .js-plotly-plot').data.map(trace => trace.name)"
+        found: list[str] = self.chrome.execute_script(script)
+        return found
+
+
+@pytest.fixture
+def page(chromium: Chrome, address: str) -> Page:
+    chromium.get_log("browser")  # type: ignore[no-untyped-call]
+    chromium.get(address)
+    page = Page(chromium)
+    page.until(lambda: "Paper's test" in page.text("told"))
+    return page
+
+
+def complaints(page: Page) -> list[str]:
+    log = page.chrome.get_log("browser")  # type: ignore[no-untyped-call]
+    return [entry["message"] for entry in log if entry["level"] == "SEVERE"]
+
+
+def test_moving_a_slider_simulates_anew(page: Page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    assert "up to 14 along" in page.text("told")
+    handle = page.slider("kx")
+    handle.send_keys(Keys.PAGE_UP)  # ten steps at once
+    page.until(lambda: "up to 14 along" not in page.text("told"))
+    kx = float(handle.get_attribute("aria-valuenow"))
+    n = int(np.ceil(2.0 / (0.005 * kx)) - 2.0)  # T_s K_x L < 2 with L = n + 1
+    assert kx > 25.0
+    page.until(lambda: f"up to {n} along" in page.text("told"))
+    assert page.text("problem") == ""
+    assert complaints(page) == []
+
+
+def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    from agv_analysis.report.margin_table import rows
+    from agv_analysis.stability.margins import margins
+
+    def expected(kx: float) -> dict[str, str]:
+        changed = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=kx))
+        return dict(rows(margins(changed), 0.005))
+
+    def shown() -> dict[str, str]:
+        cells = "[...row.cells].map(cell => cell.innerText)"
+        rows = page.chrome.execute_script(f"return [...document.querySelectorAll('#lap tr')].map(row => {cells})")
+        return dict(rows)
+
+    before, after = expected(25.0), expected(28.0)
+
+    def is_old() -> bool:
+        return bool(page.chrome.find_element("id", "lap").get_attribute("class"))
+
+    page.until(lambda: before.items() <= shown().items() and not is_old())
+    page.slider("kx").send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)  # three moves, the last counts
+    page.until(is_old)
+    page.until(lambda: after.items() <= shown().items() and not is_old())
+    assert complaints(page) == []
+
+
+def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
+    page.click("preset-missed")
+    page.until(lambda: "13 steps (65 ms)" in page.text("told"))
+    page.click("pin")
+    page.until(lambda: "pinned" in page.names("track"))
+    page.click("preset-predicted")
+    page.until(lambda: "predicted: with an exact model" in page.text("told"))
+    errors = page.text("told").splitlines()[0]
+    now, pinned = errors.removeprefix("Error in the last tenth at most ").split(" m at most ")
+    assert float(now) < 1e-6 < 1e3 < float(pinned.removesuffix(" m"))
+    assert page.names("time").count("pinned") == 3
+    page.click("unpin")
+    page.until(lambda: "pinned" not in page.names("time"))
+    assert complaints(page) == []
+
+
+def test_a_bad_setting_says_why_and_a_good_one_takes_it_back(page: Page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    more = page.chrome.find_element("id", "more")
+    more.send_keys("controller.kx=-3.0")
+    page.until(lambda: "controller.kx must be in [0, 1e+06], got -3.0" in page.text("problem"))
+    more.send_keys(Keys.CONTROL, "a")
+    more.send_keys("plant.duration=20.0")
+    page.until(lambda: page.text("problem") == "")
+    assert complaints(page) == []
+
+
+def test_what_is_exported_is_what_is_shown(page: Page, base: Scenario) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    page.slider("kx").send_keys(Keys.ARROW_RIGHT)
+    page.until(lambda: page.slider("kx").get_attribute("aria-valuenow") == "26")
+    page.click("export")
+    page.until(lambda: "explored.yaml" in page.text("exported"))
+    command, _, text = page.text("exported").partition("\n\n")
+    assert command == "agv-ncs simulate explored.yaml --report explored.html"
+    found = parse_scenario(text, "exported")
+    assert found == dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=26.0))
+
+
+def test_it_is_dark_where_all_else_is(page: Page) -> None:
+    """Paper and ink, on the page and in its plots, are as far apart as the guidelines for the web ask (4.5)."""
+
+    def contrast(one: str, other: str) -> float:
+        def luminance(colour: str) -> float:
+            parts = [int(part) / 255.0 for part in re.findall(r"\d+", colour)[:3]]
+            red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts)
+            return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+        low, high = sorted((luminance(one), luminance(other)))
+        return (high + 0.05) / (low + 0.05)
+
+    def colour(selector: str, name: str) -> str:
+        script = "return getComputedStyle(document.querySelector(arguments[0]))[arguments[1]]"
+        return str(page.chrome.execute_script(script, selector, name))
+
+    papers = {}
+    try:
+        for scheme in ("dark", "light"):
+            wanted = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+            page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", wanted)
+            papers[scheme] = colour("body", "backgroundColor")
+            inks = [colour("#told", "color"), colour("label", "color"), colour("#plot-time .xtick text", "fill")]
+            assert min(contrast(ink, papers[scheme]) for ink in inks) > 4.5, inks
+    finally:
+        page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert contrast("0, 0, 0", papers["dark"]) < 2.0 < contrast("0, 0, 0", papers["light"])
+
+
+# -- on the command line ----------------------------------------------------------------------------------------------
+
+
+def test_the_command_says_where_the_page_is_and_ends_on_ctrl_c(start: Start) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    served = start("agv_analysis.cli", "explore", "config/paper.yaml", "--port", "0", "--no-browser")
+    address = served.wait_for("explore:").split()[1]
+    assert address.startswith("http://127.0.0.1:")
+    served.process.send_signal(signal.SIGINT)
+    status, said = served.end()
+    assert (status, "Traceback" in said) == (0, False), said
+
+
+def ask_for_the_lap(address: str, base: Scenario) -> None:
+    """What the page asks for after a move; the server may go away meanwhile."""
+    from agv_analysis.explore.app import KEYS
+
+    values = values_of(base)
+    state = [{"id": key, "property": "value", "value": values[key]} for key in KEYS]
+    state.append({"id": "pinned", "property": "data", "value": None})
+    inputs = [{"id": "problem", "property": "children", "value": ""}]
+    with urlopen(f"{address}_dash-dependencies") as answer:
+        [output] = [
+            one["output"] for one in json.load(answer) if one["inputs"] == [{"id": "problem", "property": "children"}]
+        ]
+    outputs = [
+        dict(zip(("id", "property"), name.split(".", 1), strict=True)) for name in output.strip(".").split("...")
+    ]
+    asked = {
+        "output": output,
+        "outputs": outputs,
+        "inputs": inputs,
+        "state": state,
+        "changedPropIds": ["problem.children"],
+    }
+    request = Request(
+        f"{address}_dash-update-component", json.dumps(asked).encode(), {"Content-Type": "application/json"}
+    )
+    with contextlib.suppress(OSError, HTTPException):
+        urlopen(request, timeout=300.0).close()
+
+
+def test_ctrl_c_ends_it_in_the_midst_of_the_lap_s_criteria(start: Start, base: Scenario) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    command = ("agv_analysis.cli", "explore", "config/outages.yaml", "--port", "0", "--no-browser")
+    served = start(*command, start_new_session=True)
+    address = served.wait_for("explore:").split()[1]
+    with ThreadPoolExecutor(1) as threads:
+        threads.submit(ask_for_the_lap, address, base)
+        served.until(lambda: bool(served.children()))
+        os.killpg(served.process.pid, signal.SIGINT)  # as a terminal does
+        status, said = served.end()
+    assert (status, "Traceback" in said) == (0, False), said[-500:]
+
+
+def test_a_port_that_is_taken_is_named(agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        status, said = agv_ncs("explore", "config/paper.yaml", "--port", str(port), "--no-browser")
+    assert status == 1
+    assert f"port {port} of 127.0.0.1 cannot be used" in said
+    assert "Traceback" not in said

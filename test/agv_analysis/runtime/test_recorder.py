@@ -1,0 +1,221 @@
+"""Recordings: what other libraries read in them, what a damaged run leaves, what cannot be recorded to."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+from mcap_ros2.reader import read_ros2_messages
+from rosbags.interfaces import ConnectionExtRosbag2
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+
+from agv_analysis.bags.message_definitions import schema_of
+from agv_analysis.bags.writer import BagWriter, TopicInfo
+from agv_analysis.recordings.recording import read_run
+from agv_analysis.runtime.recorder_node import RecorderNode
+from agv_analysis.scenario import load_scenario, parse_scenario
+from agv_plant.plant_node import PlantNode
+from agv_ros.errors import UserError
+from agv_ros.executor import EXECUTORS, spin_for
+from agv_ros.node import LOOP_QOS
+
+if TYPE_CHECKING:
+    from test.conftest import Drive, Start
+
+REPOSITORY = Path(__file__).parents[3]
+AgvNcs = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def bag(drive: Drive, tmp_path: Path) -> Path:
+    drive("plant.duration=1.0", config="outages")
+    return tmp_path / "bag"
+
+
+def test_rosbags_reads_what_was_recorded(bag: Path) -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Reader(bag) as reader:
+        assert reader.message_count == sum(connection.msgcount for connection in reader.connections)
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+        assert counts["/agv/pose"] == counts["/clock"] == counts["/edge/slot"] == counts["/agv/slot"] == 200
+        assert (reader.start_time, reader.end_time) == (1_000_000_000, 1_000_000_000 + 199 * 5_000_000 + 1)
+        for connection in reader.connections:
+            assert connection.digest == store.hash_rihs01(connection.msgtype)
+            assert isinstance(connection.ext, ConnectionExtRosbag2)
+            assert connection.ext.offered_qos_profiles[0].reliability.name == "RELIABLE"
+        first = next(message for c, _, message in reader.messages() if c.topic == "/agv/pose")
+    pose: Any = store.deserialize_cdr(first, "geometry_msgs/msg/PoseStamped")
+    assert (pose.header.frame_id, pose.pose.position.y) == ("map", 5.0)
+
+
+def test_mcap_ros2_support_decodes_it_by_the_schemas_in_it(bag: Path) -> None:
+    file = str(next(bag.glob("*.mcap")))
+    frames = {m.channel.topic: m.ros_msg for m in read_ros2_messages(file, topics=["/edge/error", "/edge/cmd_vel"])}
+    assert frames["/edge/error"].header.frame_id == "base_link"
+    assert frames["/edge/error"].child_frame_id == "reference"
+    assert frames["/edge/cmd_vel"].header.frame_id == "base_link"
+
+
+def test_chunks_are_compressed_and_have_crcs_and_the_run_is_embedded(bag: Path) -> None:
+    with next(bag.glob("*.mcap")).open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        embedded = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert embedded["agv_ncs"]["seed"] == "1"
+    assert embedded["agv_ncs"]["version"]
+    asked = load_scenario(str(REPOSITORY / "config/outages.yaml"), ["plant.duration=1.0"])
+    assert parse_scenario(embedded["agv_ncs"]["params"], "bag") == asked
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert metadata["relative_file_paths"] == [next(bag.glob("*.mcap")).name]
+    assert yaml.safe_load(embedded["rosbag2"]["serialized_metadata"]) == metadata
+
+
+def test_schemas_hold_what_rosbags_knows_of_the_types() -> None:
+    """The .msg files against another library's knowledge of the same types: field by field, comments aside."""
+
+    def essence(text: str) -> list[list[str]]:
+        lines = (line.split("#")[0].split() for line in text.splitlines())
+        return [["".join(words[:1]).replace("std_msgs/", ""), *words[1:2]] for words in lines if words]
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name in ("geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/TimeReference"):
+        theirs, _ = store.generate_msgdef(name, ros_version=2)
+        ours, parts = schema_of(name), theirs.split("=" * 80 + "\n")
+        assert len(ours.split("=" * 80 + "\n")) == len(parts)
+        assert essence(ours.split("=" * 80)[0]) == [
+            [kind.rsplit("/", 1)[-1] if kind.startswith(name.split("/")[0]) else kind, field]
+            for kind, field in essence(parts[0])
+        ]
+
+
+def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) -> None:
+    where = tmp_path / "bag"
+    run = start("agv_analysis.cli", "run", "config/outages.yaml", "--bag", str(where))
+    run.until_recorded(where)
+    run.process.send_signal(signal.SIGINT)
+    status, said = run.end()
+    assert status == 1
+    assert "interrupted at step" in said
+    assert "everything that was published" in said
+    recorded = read_run(where)
+    assert 100 < len(recorded) < 20000
+    assert not recorded.unexplained
+
+
+def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, tmp_path: Path) -> None:
+    where = tmp_path / "bag"
+    run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
+    run.until_recorded(where)
+    run.process.send_signal(signal.SIGTERM)
+    status, said = run.end()
+    assert status == 1
+    assert "interrupted after step" in said
+    assert not read_run(where).unexplained
+
+
+def test_an_interrupted_run_waits_for_a_recorder_that_lags(start: Start, tmp_path: Path) -> None:
+    """The recorder's process sleeps for some hundred steps, as on a busy machine: all of them are in the bag."""
+    where = tmp_path / "bag"
+    run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    executor = EXECUTORS["single"](context=context)
+    listener = rclpy.create_node("listener", context=context, use_global_arguments=False)
+    seen: list[Clock] = []
+    listener.create_subscription(Clock, "/clock", seen.append, LOOP_QOS)
+    executor.add_node(listener)
+    assert spin_for(executor, lambda: len(seen) > 20, 60.0)
+    recorder = next(child for child in run.children() if "recorder_node" in (child / "cmdline").read_text())
+    os.kill(int(recorder.name), signal.SIGSTOP)
+    begun = len(seen)
+    assert spin_for(executor, lambda: len(seen) > begun + 300, 60.0)
+    run.process.send_signal(signal.SIGTERM)
+    os.kill(int(recorder.name), signal.SIGCONT)
+    listener.destroy_node()
+    context.try_shutdown()
+    _, said = run.end()
+    assert "everything that was published" in said
+    assert len(read_run(where)) > 300
+    assert not read_run(where).unexplained
+
+
+def test_the_recorder_says_what_it_has_missed(tmp_path: Path) -> None:
+    """A pose that was published before the recorder listened: the plant's own count gives it away."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    where, options = str(tmp_path / "bag"), {"context": context, "use_global_arguments": False}
+    executor = EXECUTORS["single"](context=context)
+    plant = PlantNode(**options)
+    executor.add_node(plant)
+    listener = rclpy.create_node("listener", **options)
+    listener.create_subscription(PoseStamped, "agv/pose", lambda _: None, LOOP_QOS)
+    assert spin_for(executor, lambda: plant.outputs[1].count > 0, 60.0)
+    recorder = RecorderNode(parameter_overrides=[Parameter("bag", value=where)], **options)
+    executor.add_node(recorder)
+    assert spin_for(executor, lambda: all(output.is_heard(2) for output in plant.outputs), 60.0)
+    plant.close()
+    assert spin_for(executor, lambda: bool(recorder.missing()), 60.0)
+    recorder.close()
+    for node in (plant, recorder, listener):
+        node.destroy_node()
+    context.try_shutdown()
+    assert recorder.failure.startswith(f"{where}: the recording is not complete, missing: ")
+    assert "of /agv/pose" in recorder.failure
+
+
+def test_an_unwritable_directory_is_named(agv_ncs: AgvNcs) -> None:
+    status, said = agv_ncs("run", "config/paper.yaml", "--bag", "/proc/bag")  # where not even root may write
+    assert status == 1
+    assert "/proc/bag: cannot be recorded to: No such file or directory" in said
+
+
+def test_a_path_below_a_file_cannot_be_recorded_to(agv_ncs: AgvNcs, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    status, said = agv_ncs("run", "config/paper.yaml", "--bag", tmp_path / "file" / "bag")
+    assert (status, said.splitlines()[-1]) == (
+        1,
+        f"Error: {tmp_path}/file/bag: cannot be recorded to: Not a directory",
+    )
+
+
+@pytest.mark.parametrize("options", [[], ["--processes"]])
+def test_a_bag_that_exists_is_not_touched(agv_ncs: AgvNcs, tmp_path: Path, options: list[str]) -> None:
+    status, said = agv_ncs("run", "config/paper.yaml", "--bag", tmp_path, *options)
+    assert status == 1
+    assert f"{tmp_path}: exists already; name a new directory or remove it first" in said.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_type_that_is_not_installed_is_named() -> None:
+    with pytest.raises(UserError, match="no_such_msgs/Thing"):
+        schema_of("no_such_msgs/msg/Thing")
+
+
+def test_a_message_that_comes_late_is_put_in_its_place(tmp_path: Path) -> None:
+    """DDS may take seconds to bring one again; a loop in lockstep has gone on for thousands of steps by then."""
+    topic = TopicInfo("/topic", "geometry_msgs/msg/PoseStamped", schema_of("geometry_msgs/msg/PoseStamped"), "", [])
+    writer = BagWriter(tmp_path / "bag", [lambda: topic], {}, by_stamp=True)
+    sent = [*range(90_000), 50_000, *range(90_000, 100_000)]
+    for ns in sent:
+        writer.write(0, b"\0", ns, ns)
+    writer.close()
+    with next((tmp_path / "bag").glob("*.mcap")).open("rb") as file:
+        times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+    assert [pair for pair in zip(times, sorted(sent), strict=True) if pair[0] != pair[1]] == []

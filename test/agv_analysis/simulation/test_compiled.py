@@ -1,0 +1,144 @@
+"""Compiled or not, the same numbers to the last bit; and nothing stale is ever run."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agv_analysis.compiled import compiled
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate
+from agv_analysis.simulation.loop import Case, at_rest, history, statistics, statistics_of_two
+from agv_analysis.simulation.single import settings_of
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.link import losses
+
+ROOT = Path(__file__).parents[3]
+PAPER = str(ROOT / "config" / "paper.yaml")
+
+SCENARIOS = {
+    "the paper": (),
+    "arc, limited": ("plant.integration=arc", "controller.v_max=6.0"),
+    "both links lossy": (
+        "relay.uplink.model=bernoulli", "relay.uplink.p=0.4", "relay.downlink.model=burst", "relay.downlink.n=3",
+    ),
+    "wild": ("relay.uplink.model=burst", "relay.uplink.n=30", "controller.kx=250.0"),
+}  # fmt: skip
+
+
+def in_another_process(code: str, cache: Path, *arguments: str) -> str:
+    environment = {
+        **{name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "_ROS_WHEELS"))},
+        "XDG_CACHE_HOME": str(cache),
+        "PYTHONPATH": str(ROOT),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("settings", SCENARIOS.values(), ids=SCENARIOS)
+def test_compiled_and_plain_agree_to_the_last_bit(settings: tuple[str, ...]) -> None:
+    pytest.importorskip("numba")
+    run = simulate(load_scenario(PAPER, [*settings, "plant.duration=20.0"]))
+    steps = len(run)
+    start, numbers = at_rest(*run.scenario.plant.initial_pose), settings_of(run.scenario)
+    reference = run.reference.tolist()
+    plain = Case(run.lost.tolist(), run.downlink_lost.tolist(), start, numbers)
+    fast = Case(run.lost, run.downlink_lost, start, numbers)
+    rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
+    assert history(reference, plain, rows, n_ul) == steps
+    assert rows.tobytes() == np.hstack([run.pose, run.error, run.command]).tobytes()
+    assert n_ul.tolist() == run.n_ul.tolist()
+    assert statistics(reference, plain) == compiled(statistics)(run.reference, fast)
+    slower = fast._replace(settings=numbers._replace(kx=5.0))
+    both = compiled(statistics_of_two)(run.reference, fast, slower)
+    assert both == (compiled(statistics)(run.reference, fast), compiled(statistics)(run.reference, slower))
+
+
+WITHOUT_NUMBA = """
+import sys
+sys.modules["numba"] = None
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate, simulate_batch
+scenario = load_scenario(sys.argv[1], sys.argv[2:])
+run = simulate(scenario)
+print(run.pose.tobytes().hex(), run.error.tobytes().hex(), simulate_batch([scenario], [5]).tobytes().hex())
+"""
+
+
+def test_without_numba_everything_runs_as_it_is(tmp_path: Path) -> None:
+    from agv_analysis.simulation import simulate_batch
+
+    settings = (*SCENARIOS["both links lossy"], "plant.duration=2.0")
+    scenario = load_scenario(PAPER, settings)
+    run = simulate(scenario)
+    expected = [run.pose.tobytes(), run.error.tobytes(), simulate_batch([scenario], [5]).tobytes()]
+    found = in_another_process(WITHOUT_NUMBA, tmp_path, PAPER, *settings).split()
+    assert found == [part.hex() for part in expected]
+
+
+CALL = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import outer
+from agv_analysis.compiled import compiled
+print(compiled(outer.outer)(2.0))
+"""
+
+
+def test_a_change_in_any_file_or_constant_is_seen_in_spite_of_the_cache(tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    folder, cache = tmp_path / "code", tmp_path / "cache"
+    folder.mkdir()
+    (folder / "outer.py").write_text(
+        "from inner import inner\nfrom constants import FACTOR\ndef outer(x):\n    return FACTOR * inner(x)\n"
+    )
+    (folder / "inner.py").write_text("def inner(x):\n    return x + 1.0\n")
+    (folder / "constants.py").write_text("FACTOR = 10.0\n")
+    assert in_another_process(CALL, cache, str(folder)) == "30.0\n"
+    assert list(cache.rglob("*.nbc")), "nothing was kept"
+    kept = sorted(cache.rglob("*.nbc"))
+    assert in_another_process(CALL, cache, str(folder)) == "30.0\n"
+    assert sorted(cache.rglob("*.nbc")) == kept, "what was kept was not found again"
+    (folder / "inner.py").write_text("def inner(x):\n    return x + 2.0\n")
+    assert in_another_process(CALL, cache, str(folder)) == "40.0\n"
+    (folder / "constants.py").write_text("FACTOR = 100.0\n")
+    assert in_another_process(CALL, cache, str(folder)) == "400.0\n"
+
+
+LOST = """
+import sys
+from agv_analysis.simulation.channel_outcomes import Air
+from agv_plant.parameters import ChannelParameters
+channel = ChannelParameters(model=sys.argv[1], p=0.5, r=0.5, n=2)
+print(*Air(3, 40).verdicts(channel, "uplink").astype(int), sep="")
+"""
+
+
+def test_what_is_kept_of_one_channel_model_is_not_taken_for_another(tmp_path: Path) -> None:
+    """All of them run through one loop, whose code does not say which model is in it."""
+    pytest.importorskip("numba")
+    models = ("bernoulli", "burst", "gilbert_elliott")
+    found = [in_another_process(LOST, tmp_path, model) for model in models]
+    kept = sorted(tmp_path.rglob("*.nbc"))
+    assert found[1] == f"0{'110' * 13}\n"
+    for model, verdicts in zip(models, found, strict=True):
+        expected = losses(ChannelParameters(model=model, p=0.5, r=0.5, n=2), 3, "uplink", 40)
+        assert verdicts == "".join(map(str, expected.astype(int))) + "\n"
+    assert [in_another_process(LOST, tmp_path, model) for model in models] == found
+    assert sorted(tmp_path.rglob("*.nbc")) == kept, "what was kept was not found again"
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_each_time(tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "outer.py").write_text("def outer(x):\n    return 3.0 * x\n")
+    assert in_another_process(CALL, tmp_path / "file" / "cache", str(tmp_path)) == "6.0\n"

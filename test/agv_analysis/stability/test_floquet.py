@@ -1,0 +1,177 @@
+"""Multipliers of a lap against dense products, eigenvalues, and the derivative of whole simulated runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from agv_analysis.run import Run
+from agv_analysis.scenario import Scenario, load_scenario
+from agv_analysis.simulation import simulate
+from agv_analysis.stability.floquet import constant_delay, drop_sequence, largest_constant_delay, trajectory
+from agv_analysis.stability.linearisation import step_matrices
+from agv_analysis.stability.products import growths, log_spectral_radius, ordered_product
+from agv_cloud.parameters import ControllerParameters
+
+if TYPE_CHECKING:
+    from test.conftest import Lap
+
+CONFIG = str(Path(__file__).parents[3] / "config/paper.yaml")
+TS = 0.005
+Floats = NDArray[np.float64]
+
+
+# -- constant outdatedness -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
+@pytest.mark.parametrize(("kx", "last"), [(5.0, 62), (25.0, 12), (250.0, 0)])
+def test_the_canonical_scenario_whatever_the_track(lap: Lap, track: str, kx: float, last: int) -> None:
+    v, w = lap(track)[1:]
+    assert largest_constant_delay(v, w, ControllerParameters(kx=kx), TS) == last
+    assert (
+        constant_delay(last, v, w, ControllerParameters(kx=kx), TS)
+        < 0.0
+        < constant_delay(last + 1, v, w, ControllerParameters(kx=kx), TS)
+    )
+
+
+@pytest.mark.parametrize("n", [0, 1, 3, 7])
+@pytest.mark.parametrize("track", ["paper", "eight", "warehouse"])
+def test_a_short_lap_by_the_product_of_its_companions(lap: Lap, track: str, n: int) -> None:
+    v, w = lap(track, 60)[1:]
+    v, by = 10.0 * v, ControllerParameters(kx=60.0, ky=2.0, ktheta=3.0)
+    F, G = step_matrices(v, w, by, TS)
+    product = np.eye(3 * (n + 1))
+    for k in range(60):
+        lifted = np.eye(3 * (n + 1), k=-3)
+        lifted[:3, :3] = F[k]
+        lifted[:3, -3:] += G[k]
+        product = lifted @ product
+    truth = math.log(np.abs(np.linalg.eigvals(product)).max())
+    assert constant_delay(n, v, w, by, TS) == pytest.approx(truth, abs=1e-6)
+
+
+def test_nothing_stable_and_everything_stable(lap: Lap) -> None:
+    v, w = lap("paper", 400)[1:]
+    assert largest_constant_delay(v, w, ControllerParameters(kx=401.0), TS) == -1
+    assert largest_constant_delay(v, w, ControllerParameters(kx=1.0), TS, limit=20) is None
+    assert largest_constant_delay(0.0 * v, w, ControllerParameters(kx=0.0), TS) == -1
+
+
+# -- a given sequence of losses --------------------------------------------------------------------------------------
+
+
+def by_step(lost: NDArray[np.bool_], v: Floats, w: Floats, by: ControllerParameters) -> Floats:
+    """Log moduli of the lap's multipliers from 6 x 6 matrices of (error, held sample), one a step."""
+    F, G = step_matrices(v, w, by, TS)
+    zero, one, product, log_scale = np.zeros((3, 3)), np.eye(3), np.eye(6), 0.0
+    for F_k, G_k, is_lost in zip(F, G, lost.tolist(), strict=True):
+        now = np.block([[F_k, G_k], [zero, one]]) if is_lost else np.block([[F_k + G_k, zero], [one, zero]])
+        product = now @ product
+        size = np.abs(product).max()
+        product, log_scale = product / size, log_scale + math.log(size)
+    return np.sort(np.log(np.abs(np.linalg.eigvals(product)) + 1e-300))[::-1][:3] + log_scale
+
+
+@settings(deadline=None, derandomize=True, max_examples=30)
+@given(st.integers(0, 10_000), st.floats(0.0, 0.9), st.sampled_from(["paper", "eight", "warehouse"]))
+def test_random_sequences_by_step(lap: Lap, seed: int, p: float, track: str) -> None:
+    v, w = lap(track, 80)[1:]
+    lost = np.random.default_rng(seed).random(80) < p
+    by = ControllerParameters(kx=35.0, ky=2.0, ktheta=3.0)
+    found, truth = drop_sequence(lost, 10.0 * v, w, by, TS), by_step(lost, 10.0 * v, w, by)
+    if lost.all():
+        assert found.tolist() == [0.0, 0.0, 0.0]
+    else:
+        # The first slots may be lost as well: they belong to the last burst of the lap before.
+        np.testing.assert_allclose(found, truth, atol=1e-6)
+
+
+def test_on_a_line_a_sequence_is_a_product_of_numbers() -> None:
+    """Along: the product of 1 - a L over the bursts; it may hold a factor 0."""
+    lengths = [3, 1, 20, 5, 9, 30]
+    lost = np.concatenate([[False] + [True] * (length - 1) for length in lengths])
+    v, w = np.ones(len(lost)), np.zeros(len(lost))
+    truth = sum(math.log(abs(1.0 - 0.125 * length)) for length in lengths)
+    assert np.abs(drop_sequence(lost, v, w, ControllerParameters(), TS) - truth).min() < 1e-9
+    assert drop_sequence(lost, 0.0 * v, w, ControllerParameters(), TS) == pytest.approx([truth], abs=1e-9)
+    deadbeat = drop_sequence(
+        np.zeros(50, dtype=np.bool_), np.zeros(50), np.zeros(50), ControllerParameters(kx=200.0), TS
+    )
+    assert deadbeat.tolist() == [-math.inf]
+
+
+def test_nothing_received_is_an_open_loop() -> None:
+    lost = np.ones(20, dtype=np.bool_)
+    assert drop_sequence(lost, np.ones(20), np.zeros(20), ControllerParameters(), TS).tolist() == [0.0, 0.0, 0.0]
+
+
+# -- the motion that was driven --------------------------------------------------------------------------------------
+
+
+def scenario_of(v_max: float, model: str) -> Scenario:
+    setting = [f"relay.uplink.{model}", "relay.uplink.p=0.4", "relay.uplink.n=5", "plant.duration=0.505"]
+    return load_scenario(CONFIG, [*setting, "error_detector.lap_time=1.0", f"controller.v_max={v_max}"])
+
+
+def started(scenario: Scenario, pose: Floats) -> Run:
+    x, y, theta = pose.tolist()
+    return simulate(
+        dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, initial_pose=(x, y, theta)))
+    )
+
+
+@pytest.mark.parametrize("v_max", [math.inf, 6.0])
+@pytest.mark.parametrize("model", ["model=perfect", "model=bernoulli", "model=burst"])
+def test_a_run_by_its_numerical_derivative(v_max: float, model: str) -> None:
+    """100 steps far off the reference, each column of dX_c(100) / dX_c(0) from two displaced runs."""
+    scenario, start, h = scenario_of(v_max, model), np.array([0.3, 0.6, 1.2]), 1e-6
+    run = started(scenario, start)
+    derivative = np.column_stack([
+        (started(scenario, start + h * unit).pose[100] - started(scenario, start - h * unit).pose[100]) / (2.0 * h)
+        for unit in np.eye(3)
+    ])  # fmt: skip
+    truth = np.sort(np.log(np.abs(np.linalg.eigvals(derivative))))[::-1]
+    found = trajectory(run.pose[:100], run.reference[:100], run.lost[:100], scenario.controller, TS)
+    np.testing.assert_allclose(found[:2], truth[:2], atol=1e-5)
+    assert found[2] == pytest.approx(truth[2], abs=0.05)  # of 1e-9: what differences of 1e-6 can tell
+
+
+# -- long products ---------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, derandomize=True, max_examples=40)
+@given(st.integers(0, 10_000), st.integers(1, 17), st.integers(1, 3))
+def test_products_in_order(seed: int, count: int, size: int) -> None:
+    factors = np.random.default_rng(seed).standard_normal((count, size, size))
+    truth = np.eye(size)
+    for factor in factors:
+        truth = factor @ truth
+    product, log_scale = ordered_product(factors)
+    np.testing.assert_allclose(math.exp(log_scale) * product, truth, rtol=1e-9, atol=1e-9 * np.abs(truth).max())
+    moduli = np.sort(np.log(np.abs(np.linalg.eigvals(truth))))[::-1]
+    assert log_spectral_radius(factors) == pytest.approx(moduli[0], abs=1e-9)
+    np.testing.assert_allclose(growths(factors), moduli, atol=1e-6)
+
+
+def test_products_beyond_the_range_of_numbers() -> None:
+    """10 000 times diag(2, 1/2, 1/4): each direction keeps its own growth."""
+    factors = np.broadcast_to(np.diag([0.5, 2.0, 0.25]), (10_000, 3, 3))
+    np.testing.assert_allclose(growths(factors), 10_000 * np.log([2.0, 0.5, 0.25]), rtol=1e-12)
+    assert log_spectral_radius(factors) == pytest.approx(10_000 * math.log(2.0))
+
+
+def test_a_nilpotent_product() -> None:
+    factors = np.zeros((3, 2, 2))
+    factors[:, 0, 1] = 1.0
+    assert log_spectral_radius(factors) == -math.inf
+    assert growths(factors).tolist() == [-math.inf, -math.inf]

@@ -1,0 +1,143 @@
+"""Losses on both links: against every sequence of outcomes, against one link alone, and against the loop driven."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
+from agv_analysis.run import Floats
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate_batch
+from agv_analysis.stability import mean_square, mean_square_two_links
+from agv_analysis.stability.linearisation import HELD, Edge, seen, step_matrices
+from agv_analysis.stability.margins import margins
+from agv_cloud.parameters import ControllerParameters
+
+PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
+TS = 0.005
+GAINS = ControllerParameters(kx=60.0, ky=4.0, ktheta=6.0)
+ONE = np.full(1, 1.2), np.full(1, 0.3)
+ONE_STRAIGHT = np.ones(1), np.zeros(1)
+
+
+def expected_square(
+    F: Floats, G: Floats, H: Floats | None, uplink: Chain, downlink: Chain, stops: bool, steps: int
+) -> float:
+    """E[|e|^2] after some steps from e = h = c = 1, channels stationary: the sum over all that can happen."""
+    total = 0.0
+    states = list(itertools.product(range(len(uplink.delivery)), range(len(downlink.delivery))))
+
+    def go(k: int, chance: float, i: int, j: int, e: Floats, h: Floats, c: Floats) -> None:
+        nonlocal total
+        if chance == 0.0:
+            return
+        if k == steps:
+            total += chance * float(e @ e)
+            return
+        for u, d in itertools.product((True, False), repeat=2):
+            share = uplink.delivery[i] if u else 1.0 - uplink.delivery[i]
+            share *= downlink.delivery[j] if d else 1.0 - downlink.delivery[j]
+            at_edge = e if u else h
+            at_plant = at_edge if d else np.zeros_like(c) if stops else c
+            e_next, h_next = F @ e + G @ at_plant, at_edge if H is None else H @ at_edge
+            for i_next, j_next in states:
+                after = share * uplink.transition[i, i_next] * downlink.transition[j, j_next]
+                go(k + 1, chance * after, i_next, j_next, e_next, h_next, at_plant)
+
+    for i, j in states:
+        ones = np.ones(len(F))
+        go(0, float(uplink.stationary[i] * downlink.stationary[j]), i, j, ones, ones, ones)
+    return total
+
+
+@pytest.mark.parametrize("stops", [False, True])
+@pytest.mark.parametrize("edge", [HELD, Edge(True, 0.4)])
+@pytest.mark.parametrize(
+    ("uplink", "downlink", "steps"),
+    [(bernoulli(0.3), bernoulli(0.6), 5), (gilbert_elliott(0.2, 0.5), bernoulli(0.4), 4)],
+)
+def test_the_moments_are_those_of_all_that_can_happen(
+    stops: bool, edge: Edge, uplink: Chain, downlink: Chain, steps: int
+) -> None:
+    F, G = step_matrices(*ONE, GAINS, TS)
+    G, H = seen(F, G, edge)
+    maps = [
+        mean_square_two_links.step_maps(F, G, H, u, d, stops)[0] for u, d in itertools.product((True, False), repeat=2)
+    ]
+    transition, probabilities = mean_square_two_links.joint(uplink, downlink)
+    moments = np.kron(uplink.stationary, downlink.stationary)[:, None, None] * np.ones((9, 9))
+    for _ in range(steps):
+        after = [
+            sum(p * A @ Z @ A.T for p, A in zip(row, maps, strict=True))
+            for row, Z in zip(probabilities, moments, strict=True)
+        ]
+        moments = np.einsum("st,sij->tij", transition, np.array(after))
+    found = float(np.trace(moments.sum(axis=0)[:3, :3]))
+    truth = expected_square(F[0], G[0], None if H is None else H[0], uplink, downlink, stops, steps)
+    assert found == pytest.approx(truth, rel=1e-12)
+
+
+@pytest.mark.parametrize("chain", [bernoulli(0.7), gilbert_elliott(0.1, 0.2)])
+def test_one_link_alone(chain: Chain) -> None:
+    """Of a command that is held it does not matter on which link it was lost."""
+    F, G = step_matrices(*ONE, GAINS, TS)
+    truth = math.log(mean_square.spectral_radius(F[0], G[0], chain))
+    assert mean_square_two_links.lap_growth(*ONE, GAINS, TS, chain, bernoulli(0.0)) == pytest.approx(truth, abs=1e-7)
+    assert mean_square_two_links.lap_growth(*ONE, GAINS, TS, bernoulli(0.0), chain) == pytest.approx(truth, abs=1e-7)
+
+
+def test_the_lap_and_the_matrix_agree() -> None:
+    """Two implementations: the recursion along a lap and the matrix of it."""
+    speeds = np.full(2000, 1.2), np.full(2000, 0.3)
+    chains = bernoulli(0.5), gilbert_elliott(0.1, 0.3)
+    truth = 2000 * mean_square_two_links.lap_growth(*ONE, GAINS, TS, *chains)
+    speeds[0][-1] = np.nextafter(1.2, 2.0)  # not constant, so that the lap is driven
+    assert mean_square_two_links.lap_growth(*speeds, GAINS, TS, *chains) == pytest.approx(truth, rel=1e-6)
+
+
+def test_a_plant_that_stops_at_every_loss_of_everything_is_open() -> None:
+    found = mean_square_two_links.lap_growth(*ONE_STRAIGHT, GAINS, TS, bernoulli(0.0), bernoulli(1.0), stops=True)
+    assert found == pytest.approx(0.0, abs=0.05)  # an error that stays, or grows as k^2 across
+
+
+@pytest.mark.parametrize(("p", "contracts"), [(0.6, True), (0.95, False)])
+def test_simulated_twins_on_both_sides_of_the_border(p: float, contracts: bool) -> None:
+    """Equal independent losses on both links of a straight track, K_x = 25: the border lies between."""
+    wanted = load_scenario(PAPER, [
+        "error_detector.track=line", f"plant.initial_pose=[0.0, 0.0, {math.pi / 2}]", "plant.duration=20.0",
+        "relay.uplink.model=bernoulli", f"relay.uplink.p={p}",
+        "relay.downlink.model=bernoulli", f"relay.downlink.p={p}",
+    ])  # fmt: skip
+    growth = mean_square_two_links.lap_growth(*ONE_STRAIGHT, wanted.controller, TS, bernoulli(p), bernoulli(p))
+    assert (growth < 0.0) == contracts
+    square = np.mean(simulate_batch([wanted], range(1, 101), twins=True)["contraction"] ** 2)
+    assert (square < 1e-3) if contracts else (square > 1e3)
+
+
+def test_the_margins_have_it_where_commands_are_lost() -> None:
+    lossy = ("relay.uplink.model=bernoulli", "relay.uplink.p=0.5", "relay.downlink.model=bernoulli")
+    line = ("error_detector.track=line", "relay.downlink.p=0.6")
+    found = margins(load_scenario(PAPER, [*lossy, *line]))
+    truth = mean_square_two_links.lap_growth(*ONE_STRAIGHT, ControllerParameters(), TS, bernoulli(0.5), bernoulli(0.6))
+    assert found.both_links == pytest.approx(truth, abs=1e-6)
+    assert found.to_json()["both_links"] == {"mean_square_growth": found.both_links}
+
+
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("plant.downlink_policy=ramp", "not for ramp"),
+        ("relay.downlink.correlation=0.5", "independently"),
+        ("relay.downlink.p=0.0", "loses nothing"),
+    ],
+)
+def test_where_there_is_no_answer_there_is_a_reason(setting: str, reason: str) -> None:
+    line = ("error_detector.track=line", "relay.downlink.model=bernoulli", "relay.downlink.p=0.6")
+    found = margins(load_scenario(PAPER, [*line, setting]))
+    assert found.both_links is None
+    assert reason in found.to_json()["both_links"]["mean_square_growth_reason"]
