@@ -43,7 +43,7 @@ from agv_ros.codec import (
     stamp_of,
 )
 from agv_ros.executor import run_node
-from agv_ros.message_sync import Joined, SlotJoin
+from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.message_types import ODOMETRY
 from agv_ros.node import LoopNode
 from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
@@ -66,7 +66,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         super().__init__("error_detector", ErrorDetectorParameters, **node_options)
         is_path = self.settings.track == PATH
         self.reference: Reference | PathReference = PathReference() if is_path else Reference(self.settings)
-        self._join: SlotJoin[Pose] = SlotJoin(self.grid.start_ns)
+        self._join: MessageSync[Pose] = MessageSync(self.grid.start_ns)
         self._steps = Steps(self.grid)
         self._blind = 0
         self._predicts = self.settings.policy == "predict"

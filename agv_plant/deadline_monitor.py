@@ -7,7 +7,7 @@ import numpy as np
 _WINDOW = 20_000
 
 
-class Punctuality:
+class DeadlineMonitor:
     """Statistics of ticks that are due every `period_ns`.
 
     A tick belongs to the nearest multiple of the period. Each multiple without a tick is a missed deadline.

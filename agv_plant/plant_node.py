@@ -18,13 +18,13 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from agv_plant.deadline_monitor import Punctuality
+from agv_plant.deadline_monitor import DeadlineMonitor
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.parameters import PlantParameters
 from agv_plant.random_stream import normals_of
 from agv_plant.vehicle.motion import NOISE, SLIP, Motion, body_of, measured, move
 from agv_plant.vehicle.unicycle import State
-from agv_plant.zero_order_hold import HeldCommand
+from agv_plant.zero_order_hold import ZeroOrderHold
 from agv_ros.codec import (
     FRAME_AGV,
     Command,
@@ -37,7 +37,7 @@ from agv_ros.codec import (
     stamp_of,
 )
 from agv_ros.executor import run_node
-from agv_ros.message_sync import Joined, SlotJoin
+from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.node import LoopNode
 from agv_ros.speeds_codec import decode_speeds
 from agv_ros.stamps import to_nanoseconds
@@ -81,9 +81,9 @@ class PlantNode(LoopNode[PlantParameters]):
         self._noise = normals_of(settings.seed, NOISE)
         self._slip = normals_of(settings.seed, SLIP)
         self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
-        self._join: SlotJoin[Command] = SlotJoin(self.grid.start_ns)
-        self._held = HeldCommand(to_nanoseconds(settings.cmd_vel_timeout))
-        self.punctuality = Punctuality(self.grid.ts_ns)
+        self._join: MessageSync[Command] = MessageSync(self.grid.start_ns)
+        self._held = ZeroOrderHold(to_nanoseconds(settings.cmd_vel_timeout))
+        self.deadline_monitor = DeadlineMonitor(self.grid.ts_ns)
         self._lockstep = settings.clock == "lockstep"
         self._pose_out = self.output(PoseStamped, "agv/pose")
         self._clock_out = self.output(Clock, "/clock", side=True)
@@ -246,12 +246,12 @@ class PlantNode(LoopNode[PlantParameters]):
     # -- realtime ----------------------------------------------------------------------------------------------------
 
     def _keep_time(self) -> None:
-        self.punctuality.start(time.monotonic_ns())
+        self.deadline_monitor.start(time.monotonic_ns())
         self._publish()
         self.create_timer(self.settings.ts, self._tick, clock=self._steady)
 
     def _tick(self) -> None:
-        due = self.punctuality.tick(time.monotonic_ns())
+        due = self.deadline_monitor.tick(time.monotonic_ns())
         while self.k < due and not self.finished:
             self._advance(self._held.at(self.grid.stamp(self.k + 1)))
 
@@ -259,7 +259,7 @@ class PlantNode(LoopNode[PlantParameters]):
         """Progress; in realtime also punctuality and what became of commands."""
         facts = {"step": str(self.k)}
         if not self._lockstep:
-            facts |= {name: f"{value:.6g}" for name, value in self.punctuality.summary().items()}
+            facts |= {name: f"{value:.6g}" for name, value in self.deadline_monitor.summary().items()}
             facts |= {"stops without command": str(self._held.stops), "outdated commands": str(self._held.outdated)}
         return facts
 

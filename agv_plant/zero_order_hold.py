@@ -5,7 +5,7 @@ from __future__ import annotations
 from agv_ros.codec import Command
 
 
-class HeldCommand:
+class ZeroOrderHold:
     """Zero-order hold with a limit on age.
 
     `outdated` counts commands that are not obeyed for their stamp: they came after a newer one, or are from the future

@@ -45,7 +45,7 @@ MOST_WAITING = 1000
 """Messages and slots that wait for each other at most, as many as the queue of a topic holds."""
 
 
-class SlotJoin(Generic[M]):
+class MessageSync(Generic[M]):
     """Holds messages and slots until they fit together.
 
     `outdated` counts slots and messages that came too late to matter, or a second time, and were put aside;

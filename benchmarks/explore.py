@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agv_analysis.explore.response import answer
+from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import Values, scenario_of, values_of
 from agv_analysis.scenario import Scenario, load_scenario
 from benchmarks.comparison import Comparison
@@ -44,7 +44,7 @@ def measure() -> list[Comparison]:
 def scenario_and_answer(base: Scenario, values: Values, pinned: Scenario | None) -> float:
     """Seconds from the values on the page to what is sent to it."""
     begun = time.perf_counter()
-    found = answer(scenario_of(base, values), pinned)
+    found = respond(scenario_of(base, values), pinned)
     json.dumps((found.track, found.time))
     return time.perf_counter() - begun
 

@@ -96,7 +96,7 @@ def run(count: int, first: int, number: int) -> int:
         plants = [loop.plant for loop in loops]
 
         def missed() -> int:
-            return sum(plant.punctuality.missed for plant in plants)
+            return sum(plant.deadline_monitor.missed for plant in plants)
 
         def look(steps: int) -> None:
             if not listener.is_alive() and not told.is_set() and all(plant.k for plant in plants):

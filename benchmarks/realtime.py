@@ -34,7 +34,7 @@ def _bare_timer() -> dict[str, float]:
     from rclpy.clock import Clock, ClockType
     from rclpy.node import Node
 
-    from agv_plant.deadline_monitor import Punctuality
+    from agv_plant.deadline_monitor import DeadlineMonitor
     from agv_ros.executor import EXECUTORS, spin_for
 
     context = rclpy.Context()
@@ -42,15 +42,15 @@ def _bare_timer() -> dict[str, float]:
     node = Node("timer", context=context, use_global_arguments=False)
     executor = EXECUTORS["events"](context=context)
     executor.add_node(node)
-    punctuality = Punctuality(5_000_000)
-    punctuality.start(time.monotonic_ns())
+    deadline_monitor = DeadlineMonitor(5_000_000)
+    deadline_monitor.start(time.monotonic_ns())
     steady = Clock(clock_type=ClockType.STEADY_TIME)
-    node.create_timer(0.005, lambda: punctuality.tick(time.monotonic_ns()), clock=steady)
+    node.create_timer(0.005, lambda: deadline_monitor.tick(time.monotonic_ns()), clock=steady)
     spin_for(executor, lambda: False, SECONDS)
     executor.shutdown()
     node.destroy_node()
     context.try_shutdown()
-    return punctuality.summary()
+    return deadline_monitor.summary()
 
 
 def _loop() -> dict[str, float]:

@@ -23,7 +23,7 @@ from agv_analysis.compiled import compiled
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.simulation.batch import cores
-from agv_analysis.simulation.loop import Case, at_rest, statistics_of_two
+from agv_analysis.simulation.loop import RunInputs, at_rest, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.reference.reference import Reference
 from agv_plant.radio.link import losses
@@ -82,7 +82,7 @@ def _kernel(scenarios: list[Scenario], reference: NDArray[np.float64], lost: NDA
     """As many laps as there are scenarios, two at a time, nothing around them."""
     laps, never = compiled(statistics_of_two), np.zeros_like(lost)
     start = at_rest(*scenarios[0].plant.initial_pose)
-    cases = [Case(lost, never, start, settings_of(scenario)) for scenario in scenarios]
+    cases = [RunInputs(lost, never, start, settings_of(scenario)) for scenario in scenarios]
     for one, other in zip(cases[::2], cases[1::2], strict=True):
         laps(reference, one, other)
 

@@ -227,11 +227,11 @@ class Table:
 
     def _blank(self) -> NDArray[np.void]:
         """A row without any value: NaN, zero, empty."""
-        blank = np.zeros((), self._dtype)
+        empty_trace = np.zeros((), self._dtype)
         for name in self._dtype.names or ():
             if self._dtype[name].base.kind == "f":
-                blank[name] = np.nan
-        return blank
+                empty_trace[name] = np.nan
+        return empty_trace
 
     # -- values ------------------------------------------------------------------------------------------------------
 

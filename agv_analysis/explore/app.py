@@ -7,8 +7,8 @@ import signal
 from collections.abc import Callable
 from typing import Any
 
-from agv_analysis.explore.background_criteria import Newest, lap_beside
-from agv_analysis.explore.response import answer
+from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside
+from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import CHOICES, PRESETS, SLIDERS, preset_values, scenario_of, values_of
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
@@ -125,7 +125,7 @@ def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
         *settings, pinned, _ = given
         try:
             other = None if pinned is None else scenario_of(base, pinned)
-            found = answer(scenario_of(base, values(tuple(settings))), other)
+            found = respond(scenario_of(base, values(tuple(settings))), other)
         except UserError as error:
             return dash.no_update, dash.no_update, dash.no_update, str(error), "old"
         return found.track, found.time, _table(dash.html, found.rows), "", "old"
@@ -184,7 +184,7 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
 
     Raises UserError if the port is taken or Dash is not installed.
     """
-    lap = Newest(lap_beside, rest=_REST)
+    lap = LatestOnlyWorker(lap_beside, rest=_REST)
     app = build(base, lap)
     werkzeug: Any = importlib.import_module("werkzeug.serving")
     lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections

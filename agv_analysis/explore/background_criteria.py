@@ -11,7 +11,7 @@ from collections.abc import Callable
 from multiprocessing import resource_tracker
 from typing import Any, Generic, TypeVar
 
-from agv_analysis.explore.response import under_the_outages_of
+from agv_analysis.explore.response import with_channel_of
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -23,7 +23,7 @@ _NICE = 19
 
 def lap_beside(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:
     """Name, value and that of a pinned scenario, which meets the same outages; empty without one."""
-    others = {} if pinned is None else dict(lap_rows(under_the_outages_of(pinned, scenario)))
+    others = {} if pinned is None else dict(lap_rows(with_channel_of(pinned, scenario)))
     return [(name, value, others.get(name, "")) for name, value in lap_rows(scenario)]
 
 
@@ -49,7 +49,7 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
         return []
 
 
-class Newest(Generic[R]):
+class LatestOnlyWorker(Generic[R]):
     """Makes calls in another process, one at a time; of those that wait for their turn only the newest is made.
 
     So a slider that is dragged does not leave a queue behind it, and the page's own process answers moves meanwhile.

@@ -29,7 +29,7 @@ _PLACES = 100
 """Places of the track at which the lifted system is asked: all of them would take longer than the lap."""
 
 
-class Answer(NamedTuple):
+class Response(NamedTuple):
     """What the page shows."""
 
     track: dict[str, Any]
@@ -38,15 +38,15 @@ class Answer(NamedTuple):
     """Name, value, and that of the pinned setting, empty without one."""
 
 
-def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
+def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
     """Simulate a scenario and, beside it, a pinned one that meets the same outages. Raises UserError as `simulate`."""
     run = simulate(scenario)
-    other, values_of_other = (None, None) if pinned is None else _kept(under_the_outages_of(pinned, scenario))
+    other, values_of_other = (None, None) if pinned is None else _kept(with_channel_of(pinned, scenario))
     first = beside(track(run), None if other is None else track(other))
     over_time = [beside(panel(run), None if other is None else panel(other)) for panel in (distance, speed, age)]
-    values = list(told(run))
+    values = list(summary_rows(run))
     others = values_of_other or [""] * len(values)
-    return Answer(
+    return Response(
         track=figure([first], _MOST_POINTS, dots=_MOST_DOTS),
         time=figure(over_time, _MOST_POINTS),
         rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
@@ -57,10 +57,10 @@ def answer(scenario: Scenario, pinned: Scenario | None = None) -> Answer:
 def _kept(scenario: Scenario) -> tuple[Run, list[str]]:
     """A run and the values that it tells: those of a pinned setting do not change while another one is moved."""
     run = simulate(scenario)
-    return run, [value for _, value in told(run)]
+    return run, [value for _, value in summary_rows(run)]
 
 
-def under_the_outages_of(pinned: Scenario, scenario: Scenario) -> Scenario:
+def with_channel_of(pinned: Scenario, scenario: Scenario) -> Scenario:
     """The pinned scenario on the channel, and with the seed, of another one: slot by slot the same is lost."""
     own = {name: getattr(pinned.relay, name) for name in SHARED}
     return dataclasses.replace(pinned, relay=dataclasses.replace(scenario.relay, **own))
@@ -75,7 +75,7 @@ def beside(panel: Panel, pinned: Panel | None) -> Panel:
     return dataclasses.replace(panel, lines=shown)
 
 
-def told(run: Run) -> Iterator[tuple[str, str]]:
+def summary_rows(run: Run) -> Iterator[tuple[str, str]]:
     """What a run tells, and the margins that are computed at once: those of a straight track in closed form."""
     gains, ts, n = run.scenario.controller, run.ts, outages(run).n_ul_max
     e = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)

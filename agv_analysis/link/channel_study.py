@@ -19,8 +19,8 @@ from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.link.markov_channel import Chain, chain_of
 from agv_analysis.metrics.outages import LinkOutages, Steps, Verdicts, ages, link_outages
 from agv_analysis.run import Floats
-from agv_analysis.simulation.channel_outcomes import Air
-from agv_analysis.simulation.link_loop import blank, listen
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.simulation.link_loop import empty_trace, listen
 from agv_plant.channels.rayleigh import fades_per_metre, loss_rate
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
@@ -117,14 +117,14 @@ def study(
     `places` are those of the AGV in frame `map` [m], shape (slots, 2); without them it stands at the origin. Raises
     TraceError for a trace that cannot be used or must not be outrun.
     """
-    air, k = Air(seed, slots, ts), np.arange(slots)
+    air, k = ChannelRealisation(seed, slots, ts), np.arange(slots)
     places = np.zeros((slots, 2)) if places is None else places
     way = float(np.hypot(*np.diff(places, axis=0).T).sum())
     if channel.is_direct:
         lost = air.verdicts(channel, link)
         age = ages(k, lost)
         return ChannelStudy(channel, lost, age, link_outages(k, lost, age, ts), chain_of(channel), way=way)
-    marks, asked = blank(slots), air.way(channel, link)
+    marks, asked = empty_trace(slots), air.way(channel, link)
     compiled(listen)(asked, marks, numbers(places))
     age, late = k - marks.held, float(np.mean(np.asarray(asked.waits)[~marks.lost] > 0))
     return ChannelStudy(channel, marks.lost, age, link_outages(k, marks.lost, age, ts), chain_of(channel), late, way)

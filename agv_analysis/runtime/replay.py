@@ -22,7 +22,7 @@ from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.recordings.recording import TOPICS, loop_topics
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.loop import answer, at_rest, received
+from agv_analysis.simulation.loop import at_rest, edge_step, received
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.parameters import PATH
 from agv_cloud.reference.reference import Reference, ReferencePoint
@@ -133,7 +133,7 @@ def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
         if predicts:
             pose = prediction.at(k, taken, pose)
         at_edge = received(at_rest(*pose), *pose, *reference[row][:3], k - taken)
-        rows[i] = answer(at_edge, *reference[i], settings)
+        rows[i] = edge_step(at_edge, *reference[i], settings)
         if predicts and np.isfinite(run.command[i]).all():
             prediction.add_command(k, *run.command[i].tolist())
     return rows[:, :3], rows[:, 3:]

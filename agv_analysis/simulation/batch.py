@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.channel_outcomes import Air
-from agv_analysis.simulation.link_loop import Marks, blank, contraction_on_air, statistics_on_air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.simulation.link_loop import LinkTrace, contraction_over_links, empty_trace, statistics_over_links
 from agv_analysis.simulation.loop import (
-    Case,
+    RunInputs,
     Statistics,
     at_rest,
     statistics,
@@ -40,7 +40,7 @@ STATISTICS = np.dtype([
 """
 
 Table = NDArray[np.void]
-Airs = Callable[[int, int, float], Air]
+Airs = Callable[[int, int, float], ChannelRealisation]
 Job = tuple[int, int]
 """One run: (row, column) of the table, that is, scenario and seed."""
 
@@ -106,7 +106,7 @@ class _Batch:
 
     def work(self, unit: list[Job]) -> int:
         """Run one part; returns the number of its runs."""
-        airs = functools.lru_cache(maxsize=4)(Air)
+        airs = functools.lru_cache(maxsize=4)(ChannelRealisation)
         run = self._with_twins if self._twins else self._by_twos
         for track, jobs in groupby(sorted(unit, key=lambda job: self._track[job[0]]), lambda job: self._track[job[0]]):
             reference = self._reference(self._track.index(track))
@@ -136,20 +136,24 @@ class _Batch:
                 found, marks = self._on_air(reference, job, airs)
                 is_whole = found.steps == self._steps[job[0]]
                 case = self._case(job, airs)
-                yield job, found, compiled(contraction_on_air)(reference, case, twin, *marks) if is_whole else math.inf
+                yield (
+                    job,
+                    found,
+                    compiled(contraction_over_links)(reference, case, twin, *marks) if is_whole else math.inf,
+                )
 
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay
         return relay.uplink.is_direct and relay.downlink.is_direct
 
-    def _on_air(self, reference: Floats, job: Job, airs: Airs) -> tuple[Statistics, tuple[Marks, Marks]]:
+    def _on_air(self, reference: Floats, job: Job, airs: Airs) -> tuple[Statistics, tuple[LinkTrace, LinkTrace]]:
         """One run whose links have to be asked in the loop, and what became of its messages."""
         air, relay, steps = self._air(job, airs), self._scenarios[job[0]].relay, self._steps[job[0]]
-        marks = blank(steps), blank(steps)
+        marks = empty_trace(steps), empty_trace(steps)
         ways = air.way(relay.uplink, "uplink"), air.way(relay.downlink, "downlink")
-        return compiled(statistics_on_air)(reference, self._case(job, airs), *ways, *marks), marks
+        return compiled(statistics_over_links)(reference, self._case(job, airs), *ways, *marks), marks
 
-    def _air(self, job: Job, airs: Airs) -> Air:
+    def _air(self, job: Job, airs: Airs) -> ChannelRealisation:
         row, column = job
         return airs(self._seeds[column], self._steps[row], self._scenarios[row].plant.ts)
 
@@ -158,9 +162,9 @@ class _Batch:
         reference: Floats = numbers(reference_of(detector, self._steps[row]))
         return reference
 
-    def _case(self, job: Job, airs: Airs) -> Case:
+    def _case(self, job: Job, airs: Airs) -> RunInputs:
         scenario, air = self._scenarios[job[0]], self._air(job, airs)
-        return Case(
+        return RunInputs(
             numbers(air.verdicts(scenario.relay.uplink, "uplink")),
             numbers(air.verdicts(scenario.relay.downlink, "downlink")),
             at_rest(*scenario.plant.initial_pose),

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled, compiled_with, numbers
-from agv_analysis.simulation.link_loop import Way
+from agv_analysis.simulation.link_loop import LinkInputs
 from agv_analysis.simulation.noise import normals
 from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.position_dependent import kind_of
 from agv_plant.channels.registry import SHARED, TRACE, find_model
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.channel_setup import Segment, floor_of, levels_of, segments_of
+from agv_plant.radio.channel_setup import Segment, levels_of, segments_of, spatial_table_of
 from agv_plant.radio.delay import NEVER, delays_of, soonest
 from agv_plant.radio.link import Channel, delay_draws, draws, losses, own_stream
 from agv_plant.radio.schedule import is_scripted
@@ -37,7 +37,7 @@ _NUMERIC = [field.name for field in dataclasses.fields(ChannelParameters) if not
 _Numbers = namedtuple("_Numbers", _NUMERIC)  # type: ignore[misc]  # numba knows tuples, not dataclasses
 
 
-class Air:
+class ChannelRealisation:
     """Channels under one seed; keeps the random numbers and the latest verdicts, which many runs share."""
 
     def __init__(self, seed: int, steps: int, ts: float = LoopParameters.ts) -> None:
@@ -62,13 +62,13 @@ class Air:
         states = np.full(self._steps, GOOD, dtype=np.int64)
         return self._judge(channel, stream, states), states
 
-    def way(self, channel: ChannelParameters, stream: str) -> Way:
+    def way(self, channel: ChannelParameters, stream: str) -> LinkInputs:
         """All that a link needs to be asked slot by slot."""
         return self._ways(channel, stream)
 
-    def _way(self, channel: ChannelParameters, stream: str) -> Way:
+    def _way(self, channel: ChannelParameters, stream: str) -> LinkInputs:
         lost, random = self.verdicts(channel, stream), self._draws(channel, stream)
-        return way_of(channel, self._seed, stream, lost, random, self._ts)
+        return link_inputs(channel, self._seed, stream, lost, random, self._ts)
 
     def _judge(self, channel: ChannelParameters, stream: str, states: States | None = None) -> Verdicts:
         """Verdicts, and into `states` the states that decided."""
@@ -120,9 +120,9 @@ class Air:
         return draws(channel, self._seed, stream, 0, self._steps)
 
 
-def way_of(
+def link_inputs(
     channel: ChannelParameters, seed: int, stream: str, lost: Verdicts, random: NDArray[np.float64], ts: float
-) -> Way:
+) -> LinkInputs:
     """A link from what is lost wherever the AGV is, shape (N,), and the channel's random numbers, shape (N, DRAWS)."""
     steps = len(lost)
     levels, waits = np.empty((steps, 2)), np.zeros(steps, dtype=np.int64)
@@ -132,8 +132,12 @@ def way_of(
         if now.delay + now.jitter > 0.0:
             waits[segment.first : end] = _slots_under_way(segment, end, seed, stream, ts)
     waits[waits == NEVER] = 0  # lost, as said
-    floor = np.array(floor_of(channel, seed, stream) if channel.is_placed else [], dtype=np.float64).reshape(-1, 5)
-    return Way(numbers(lost), kind_of(channel.model), numbers(floor), numbers(levels), numbers(random), numbers(waits))
+    spatial_table = np.array(
+        spatial_table_of(channel, seed, stream) if channel.is_placed else [], dtype=np.float64
+    ).reshape(-1, 5)
+    return LinkInputs(
+        numbers(lost), kind_of(channel.model), numbers(spatial_table), numbers(levels), numbers(random), numbers(waits)
+    )
 
 
 def _slots_under_way(segment: Segment, end: int, seed: int, stream: str, ts: float) -> NDArray[np.int64]:

@@ -14,43 +14,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.simulation.loop import (
-    Answer,
-    Case,
-    Drive,
+    EdgeOutput,
     Flags,
     Loop,
+    MetricsAccumulator,
     Rows,
+    RunInputs,
     Settings,
     Statistics,
-    answer,
     apart,
     are_finite,
     begin,
     commanded,
+    edge_step,
     end,
     expecting,
     goes_on,
-    obey,
     outdated,
+    plant_step,
     played,
     received,
-    seen,
     sent_pose,
+    update_metrics,
     wheels,
 )
 from agv_cloud.staleness import PREDICT
 from agv_plant.channels.position_dependent import EVERYWHERE, verdict_at
-from agv_plant.vehicle.motion import plant_step
+from agv_plant.vehicle.motion import integrate
 
 
-class Way(NamedTuple):
+class LinkInputs(NamedTuple):
     """One direction of the radio on a run of N slots."""
 
     lost: Flags
     """What is lost wherever the AGV is, shape (N,)."""
     kind: int
     """Which model of those that ask for the place, or EVERYWHERE."""
-    floor: Rows
+    spatial_table: Rows
     """What it knows of the floor, shape (M, 5)."""
     levels: Rows
     """Its levels in each slot, shape (N, 2)."""
@@ -60,7 +60,7 @@ class Way(NamedTuple):
     """Slots until the message of slot k arrives if it is not lost, shape (N,)."""
 
 
-class Marks(NamedTuple):
+class LinkTrace(NamedTuple):
     """What became of the messages of one direction, slot by slot; all of shape (N,)."""
 
     lost: NDArray[np.bool_]
@@ -72,19 +72,21 @@ class Marks(NamedTuple):
     """Step of the freshest message that arrives in the slot, 0 if there is none; zeros before the run."""
 
 
-def blank(steps: int) -> Marks:
+def empty_trace(steps: int) -> LinkTrace:
     """Marks of a run that has not begun."""
-    return Marks(
+    return LinkTrace(
         np.zeros(steps, dtype=np.bool_), np.zeros(steps, dtype=np.int64), np.full(steps, math.nan),
         np.zeros(steps, dtype=np.int64),
     )  # fmt: skip
 
 
-def transmit(way: Way, marks: Marks, k: int, x: float, y: float) -> int:
+def transmit(way: LinkInputs, marks: LinkTrace, k: int, x: float, y: float) -> int:
     """Slot k of a link, of an AGV that is at (x, y) [m]: step of the freshest message that the receiver holds then."""
     lost, gain = way.lost[k], math.nan
     if way.kind != EVERYWHERE:
-        is_bad, gain = verdict_at(way.kind, way.floor, way.levels[k][0], way.levels[k][1], way.random[k][0], x, y)
+        is_bad, gain = verdict_at(
+            way.kind, way.spatial_table, way.levels[k][0], way.levels[k][1], way.random[k][0], x, y
+        )
         lost = lost or (is_bad and k > 0)
     arrival = k + way.waits[k]
     if not lost and arrival < len(marks.due):
@@ -95,7 +97,7 @@ def transmit(way: Way, marks: Marks, k: int, x: float, y: float) -> int:
     return held
 
 
-def listen(way: Way, marks: Marks, places: Rows) -> None:
+def listen(way: LinkInputs, marks: LinkTrace, places: Rows) -> None:
     """A link alone, without a loop: its slots with the AGV at the `places` [m], shape (N, 2)."""
     for k in range(len(marks.held)):
         transmit(way, marks, k, places[k][0], places[k][1])
@@ -104,9 +106,9 @@ def listen(way: Way, marks: Marks, places: Rows) -> None:
 # -- one slot ----------------------------------------------------------------------------------------------------------
 
 
-def slot_on_air(
-    loop: Loop, k: int, taken: int, ordered: int, reference: Rows, case: Case, past: NDArray[np.float64]
-) -> tuple[Loop, Answer]:
+def slot_over_links(
+    loop: Loop, k: int, taken: int, ordered: int, reference: Rows, case: RunInputs, past: NDArray[np.float64]
+) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, with the pose of step `taken` at the edge, the command of step `ordered` at the AGV.
 
     `past` has the poses that were sent, the commands, and the errors that they answer, (x, y, theta, v, w, x_e, y_e,
@@ -114,19 +116,19 @@ def slot_on_air(
     """
     x_r, y_r, theta_r, v_r, w_r = reference[k]
     held = at_the_edge(loop, k, taken, reference, past, case.settings)
-    sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
+    sent = edge_step(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
     past[k, 3], past[k, 4] = sent.v, sent.w
     past[k, 5], past[k, 6], past[k, 7] = sent.x_e, sent.y_e, sent.theta_e
     n_left, n_right = wheels(case.slip, k)
     if ordered == k:
-        return obey(held, sent, False, n_left, n_right, v_r, w_r, case.settings), sent
+        return plant_step(held, sent, False, n_left, n_right, v_r, w_r, case.settings), sent
     v, w = past[ordered, 3], past[ordered, 4]
     if are_finite(v, w, 0.0):  # else the plant has refused it, and goes on with the one before
         is_news = ordered != k - 1 - loop.n_dl
         held = commanded(held, v, w, k - 1 - ordered)
         if is_news:
             held = planned(held, ordered, k, reference, past, case.settings.plan_arc, case.settings)
-    return obey(held, sent, True, n_left, n_right, v_r, w_r, case.settings), sent
+    return plant_step(held, sent, True, n_left, n_right, v_r, w_r, case.settings), sent
 
 
 def planned(
@@ -136,7 +138,7 @@ def planned(
     """The plant holds the plan of step `ordered`, and has come to its step k."""
     if plan_arc is None:
         return loop
-    sent = Answer(past[ordered, 5], past[ordered, 6], past[ordered, 7], past[ordered, 3], past[ordered, 4])
+    sent = EdgeOutput(past[ordered, 5], past[ordered, 6], past[ordered, 7], past[ordered, 3], past[ordered, 4])
     x, y, theta = loop.x_ahead, loop.y_ahead, loop.theta_ahead
     for step in range(ordered, k):
         _, _, _, v_r, w_r = reference[step]
@@ -155,15 +157,21 @@ def at_the_edge(loop: Loop, k: int, taken: int, reference: Rows, past: NDArray[n
         for step in range(taken, k):
             v, w = past[step, 3], past[step, 4]
             if are_finite(v, w, 0.0):
-                x, y, theta = plant_step(settings.model_arc, x, y, theta, v, w, settings.ts)
+                x, y, theta = integrate(settings.model_arc, x, y, theta, v, w, settings.ts)
     return received(loop, x, y, theta, reference[taken][0], reference[taken][1], reference[taken][2], k - taken)
 
 
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
 
-def history_on_air(
-    reference: Rows, case: Case, up: Way, down: Way, up_marks: Marks, down_marks: Marks, rows: NDArray[np.float64]
+def history_over_links(
+    reference: Rows,
+    case: RunInputs,
+    up: LinkInputs,
+    down: LinkInputs,
+    up_marks: LinkTrace,
+    down_marks: LinkTrace,
+    rows: NDArray[np.float64],
 ) -> int:
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), and what became of its messages.
 
@@ -175,7 +183,7 @@ def history_on_air(
         past[k, 0], past[k, 1], past[k, 2] = sent_pose(loop, case.noise, k, case.settings)
         taken = transmit(up, up_marks, k, past[k, 0], past[k, 1])
         ordered = transmit(down, down_marks, k, past[k, 0], past[k, 1])
-        loop, sent = slot_on_air(loop, k, taken, ordered, reference, case, past)
+        loop, sent = slot_over_links(loop, k, taken, ordered, reference, case, past)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
         if not goes_on(loop, sent):
@@ -183,8 +191,8 @@ def history_on_air(
     return len(rows)
 
 
-def statistics_on_air(
-    reference: Rows, case: Case, up: Way, down: Way, up_marks: Marks, down_marks: Marks
+def statistics_over_links(
+    reference: Rows, case: RunInputs, up: LinkInputs, down: LinkInputs, up_marks: LinkTrace, down_marks: LinkTrace
 ) -> Statistics:
     """One run of which only the metrics are kept, and the marks."""
     run, past = begin(reference, case), np.empty((len(up_marks.held), 8))
@@ -192,21 +200,29 @@ def statistics_on_air(
         past[k, 0], past[k, 1], past[k, 2] = sent_pose(run.loop, case.noise, k, case.settings)
         taken = transmit(up, up_marks, k, past[k, 0], past[k, 1])
         ordered = transmit(down, down_marks, k, past[k, 0], past[k, 1])
-        run = proceed_on_air(run, k, taken, ordered, reference, case, past)
+        run = proceed_over_links(run, k, taken, ordered, reference, case, past)
         if not run.goes_on:
             break
     return end(run, reference[0][1] - case.start.y, case.settings.ts)
 
 
-def proceed_on_air(
-    run: Drive, k: int, taken: int, ordered: int, reference: Rows, case: Case, past: NDArray[np.float64]
-) -> Drive:
+def proceed_over_links(
+    run: MetricsAccumulator,
+    k: int,
+    taken: int,
+    ordered: int,
+    reference: Rows,
+    case: RunInputs,
+    past: NDArray[np.float64],
+) -> MetricsAccumulator:
     """The run after slot k, as `loop.proceed`."""
-    loop, sent = slot_on_air(run.loop, k, taken, ordered, reference, case, past)
-    return seen(run, k, reference[k][0], reference[k][1], loop, sent)
+    loop, sent = slot_over_links(run.loop, k, taken, ordered, reference, case, past)
+    return update_metrics(run, k, reference[k][0], reference[k][1], loop, sent)
 
 
-def contraction_on_air(reference: Rows, case: Case, twin: Loop, up_marks: Marks, down_marks: Marks) -> float:
+def contraction_over_links(
+    reference: Rows, case: RunInputs, twin: Loop, up_marks: LinkTrace, down_marks: LinkTrace
+) -> float:
     """How far a run and its twin, begun elsewhere, are apart in the end, as in `loop.statistics_of_twins`.
 
     Both meet what was marked when the run was made: the twin loses what the run lost, wherever it is.
@@ -216,8 +232,8 @@ def contraction_on_air(reference: Rows, case: Case, twin: Loop, up_marks: Marks,
     for k in range(len(past)):
         past[k, 0], past[k, 1], past[k, 2] = sent_pose(one, case.noise, k, case.settings)
         past_of_twin[k, 0], past_of_twin[k, 1], past_of_twin[k, 2] = sent_pose(other, case.noise, k, case.settings)
-        one, sent = slot_on_air(one, k, up_marks.held[k], down_marks.held[k], reference, case, past)
-        other, said = slot_on_air(other, k, up_marks.held[k], down_marks.held[k], reference, case, past_of_twin)
+        one, sent = slot_over_links(one, k, up_marks.held[k], down_marks.held[k], reference, case, past)
+        other, said = slot_over_links(other, k, up_marks.held[k], down_marks.held[k], reference, case, past_of_twin)
         if not (goes_on(one, sent) and goes_on(other, said)):
             return math.inf
     return apart(one, other) / apart(case.start, twin)

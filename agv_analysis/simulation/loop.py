@@ -23,7 +23,7 @@ from agv_cloud.control.plan import next_error
 from agv_cloud.staleness import ALIGN, PREDICT
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import share_of_command
-from agv_plant.vehicle.motion import Body, Motion, measured, move, plant_step
+from agv_plant.vehicle.motion import Body, Motion, integrate, measured, move
 
 Rows = NDArray[np.float64] | list[list[float]]
 Flags = NDArray[np.bool_] | list[bool]
@@ -85,7 +85,7 @@ class Loop(NamedTuple):
     theta_ahead: float
 
 
-class Answer(NamedTuple):
+class EdgeOutput(NamedTuple):
     """What the edge made of a slot: eps(k) [m, m, rad] and u(k) [m/s, rad/s]; the command is NaN if it sent none."""
 
     x_e: float
@@ -95,7 +95,7 @@ class Answer(NamedTuple):
     w: float
 
 
-class Case(NamedTuple):
+class RunInputs(NamedTuple):
     """One run: the verdicts of its slots, shape (N,), the loop before slot 0 and its settings."""
 
     lost: Flags
@@ -117,19 +117,19 @@ def at_rest(x: float, y: float, theta: float) -> Loop:
 
 
 def slot(
-    loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: Case, k: int
-) -> tuple[Loop, Answer]:
+    loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: RunInputs, k: int
+) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, under the verdicts of both links on slot k and with the reference at this step."""
     n_left, n_right = wheels(case.slip, k)
     if case.lost[k]:
         held = outdated(loop)
-        sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-        return obey(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
+        sent = edge_step(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
+        return plant_step(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
     x, y, theta = sent_pose(loop, case.noise, k, case.settings)
     held = received(loop, x, y, theta, x_r, y_r, theta_r, 0)
-    sent = answer(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-    return obey(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
+    sent = edge_step(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
+    return plant_step(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
 
 
 def sent_pose(loop: Loop, noise: Rows | None, k: int, settings: Settings) -> tuple[float, float, float]:
@@ -184,7 +184,9 @@ def expecting(loop: Loop, x_ahead: float, y_ahead: float, theta_ahead: float) ->
     )  # fmt: skip
 
 
-def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings) -> Answer:
+def edge_step(
+    loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings
+) -> EdgeOutput:
     """The edge's answer, from the pose that it holds.
 
     An error beyond the range of numbers is refused by the controller, as it comes in from the wire.
@@ -193,13 +195,13 @@ def answer(loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: 
         x_r, y_r, theta_r = loop.x_then, loop.y_then, loop.theta_then
     x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, loop.x_held, loop.y_held, loop.theta_held)
     if not are_finite(x_e, y_e, theta_e):
-        return Answer(x_e, y_e, theta_e, math.nan, math.nan)
+        return EdgeOutput(x_e, y_e, theta_e, math.nan, math.nan)
     v, w = control_law(x_e, y_e, theta_e, v_r, w_r, settings.kx, settings.ky, settings.ktheta)
-    return Answer(x_e, y_e, theta_e, limit_speed(v, settings.v_max), w)
+    return EdgeOutput(x_e, y_e, theta_e, limit_speed(v, settings.v_max), w)
 
 
-def obey(
-    loop: Loop, sent: Answer, lost: bool, n_left: float, n_right: float, v_r: float, w_r: float, settings: Settings
+def plant_step(
+    loop: Loop, sent: EdgeOutput, lost: bool, n_left: float, n_right: float, v_r: float, w_r: float, settings: Settings
 ) -> Loop:
     """One sampling period of the plant under the freshest command, and of the edge's model under the one it sent.
 
@@ -213,7 +215,7 @@ def obey(
     moved = period(loop, plan.v, plan.w, n_dl, n_left, n_right, settings.body, settings)
     x_held, y_held, theta_held = loop.x_held, loop.y_held, loop.theta_held
     if settings.policy == PREDICT and are_finite(sent.v, sent.w, 0.0):
-        x_held, y_held, theta_held = plant_step(
+        x_held, y_held, theta_held = integrate(
             settings.model_arc, x_held, y_held, theta_held, sent.v, sent.w, settings.ts
         )
     return Loop(
@@ -223,19 +225,19 @@ def obey(
 
 
 def played(
-    loop: Loop, sent: Answer, v: float, w: float, n_dl: int, v_r: float, w_r: float, plan_arc: bool | None,
+    loop: Loop, sent: EdgeOutput, v: float, w: float, n_dl: int, v_r: float, w_r: float, plan_arc: bool | None,
     settings: Settings,
-) -> Answer:  # fmt: skip
+) -> EdgeOutput:  # fmt: skip
     """What the plant drives, n_dl steps after (v, w) was sent, and the error that its plan expects of the next step."""
     if plan_arc is None:
-        return Answer(loop.x_ahead, loop.y_ahead, loop.theta_ahead, v, w)
+        return EdgeOutput(loop.x_ahead, loop.y_ahead, loop.theta_ahead, v, w)
     x_e, y_e, theta_e = sent.x_e, sent.y_e, sent.theta_e
     if n_dl > 0:
         x_e, y_e, theta_e = loop.x_ahead, loop.y_ahead, loop.theta_ahead
         v, w = control_law(x_e, y_e, theta_e, v_r, w_r, settings.kx, settings.ky, settings.ktheta)
         v = limit_speed(v, settings.v_max)
     x_e, y_e, theta_e = next_error(x_e, y_e, theta_e, v, w, v_r, w_r, settings.ts, plan_arc)
-    return Answer(x_e, y_e, theta_e, v, w)
+    return EdgeOutput(x_e, y_e, theta_e, v, w)
 
 
 def period(
@@ -243,14 +245,14 @@ def period(
 ) -> Motion:
     """The plant's motion in a period under a command (v, w) that was sent n_dl steps ago."""
     if body is None:
-        x, y, theta = plant_step(settings.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
+        x, y, theta = integrate(settings.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
         return Motion(x, y, theta, v, w, 0.0)
     share = share_of_command(n_dl, settings.downlink_policy, settings.policy_steps)
     before = Motion(loop.x, loop.y, loop.theta, loop.v_driven, loop.w_driven, loop.a_driven)
     return move(before, share * v, share * w, n_left, n_right, body)
 
 
-def goes_on(loop: Loop, sent: Answer) -> bool:
+def goes_on(loop: Loop, sent: EdgeOutput) -> bool:
     """Is there a next slot? Not after a pose beyond the range of numbers, nor if the edge sent no command."""
     return are_finite(loop.x, loop.y, loop.theta) and are_finite(sent.x_e, sent.y_e, sent.theta_e)
 
@@ -263,7 +265,7 @@ def are_finite(a: float, b: float, c: float) -> bool:
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
 
-def history(reference: Rows, case: Case, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
+def history(reference: Rows, case: RunInputs, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), its age into n_ul[k], shape (N,).
 
     `reference` has shape (N, 5). Returns the number of slots until the run ended, N at most.
@@ -303,7 +305,7 @@ class Statistics(NamedTuple):
     n_ul_mean: float
 
 
-class Drive(NamedTuple):
+class MetricsAccumulator(NamedTuple):
     """A run on its way, with what has been seen of its error so far."""
 
     loop: Loop
@@ -325,23 +327,27 @@ class Drive(NamedTuple):
     n_ul_sum: int
 
 
-def begin(reference: Rows, case: Case) -> Drive:
+def begin(reference: Rows, case: RunInputs) -> MetricsAccumulator:
     """A run before slot 0."""
     band = SHARE * abs(reference[0][1] - case.start.y)
-    return Drive(case.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
+    return MetricsAccumulator(case.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
-def proceed(run: Drive, k: int, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: Case) -> Drive:
+def proceed(
+    run: MetricsAccumulator, k: int, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: RunInputs
+) -> MetricsAccumulator:
     """The run after slot k."""
     loop, sent = slot(run.loop, x_r, y_r, theta_r, v_r, w_r, case, k)
-    return seen(run, k, x_r, y_r, loop, sent)
+    return update_metrics(run, k, x_r, y_r, loop, sent)
 
 
-def seen(run: Drive, k: int, x_r: float, y_r: float, loop: Loop, sent: Answer) -> Drive:
+def update_metrics(
+    run: MetricsAccumulator, k: int, x_r: float, y_r: float, loop: Loop, sent: EdgeOutput
+) -> MetricsAccumulator:
     """The run after slot k, at which the reference was at (x_r, y_r), from the loop after it and what the edge sent."""
     dx, e = x_r - run.loop.x, y_r - run.loop.y
     size, square = abs(e), dx * dx + e * e
-    return Drive(
+    return MetricsAccumulator(
         loop,
         goes_on(loop, sent),
         k + 1,
@@ -360,7 +366,7 @@ def seen(run: Drive, k: int, x_r: float, y_r: float, loop: Loop, sent: Answer) -
     )
 
 
-def end(run: Drive, initial: float, ts: float) -> Statistics:
+def end(run: MetricsAccumulator, initial: float, ts: float) -> Statistics:
     """The metrics of a run of at least one slot, from the error [m] that it began with."""
     started = abs(initial) > NEGLIGIBLE
     beyond = -run.lowest if initial > 0.0 else run.highest
@@ -380,7 +386,7 @@ def end(run: Drive, initial: float, ts: float) -> Statistics:
     )
 
 
-def statistics(reference: Rows, case: Case) -> Statistics:
+def statistics(reference: Rows, case: RunInputs) -> Statistics:
     """One run of which only the metrics are kept; `reference` has shape (N, 5)."""
     run = begin(reference, case)
     for k in range(len(case.lost)):
@@ -391,7 +397,7 @@ def statistics(reference: Rows, case: Case) -> Statistics:
     return end(run, reference[0][1] - case.start.y, case.settings.ts)
 
 
-def statistics_of_two(reference: Rows, one: Case, other: Case) -> tuple[Statistics, Statistics]:
+def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[Statistics, Statistics]:
     """Two runs on one reference, as `statistics`; together they take little longer than one.
 
     A run is a chain in which everything waits for a sine of what came before; meanwhile the core works on the other.
@@ -407,7 +413,7 @@ def statistics_of_two(reference: Rows, one: Case, other: Case) -> tuple[Statisti
     return end(first, y_r - one.start.y, one.settings.ts), end(second, y_r - other.start.y, other.settings.ts)
 
 
-def statistics_of_twins(reference: Rows, case: Case, twin: Loop) -> tuple[Statistics, float]:
+def statistics_of_twins(reference: Rows, case: RunInputs, twin: Loop) -> tuple[Statistics, float]:
     """A run as `statistics`, and how far a twin of it, begun elsewhere and with the same losses, is in the end.
 
     That is the distance of the two AGVs in (x, y, theta) [m, m, rad] as a multiple of what it was at the beginning: a

@@ -9,8 +9,8 @@ import numpy as np
 
 from agv_analysis.metrics.outages import ages
 from agv_analysis.run import LinkSlots
-from agv_analysis.simulation.channel_outcomes import Air, Verdicts, way_of
-from agv_analysis.simulation.link_loop import Marks, Way, blank
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation, Verdicts, link_inputs
+from agv_analysis.simulation.link_loop import LinkInputs, LinkTrace, empty_trace
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, draws
 
@@ -21,14 +21,14 @@ class SimulatedLink:
     def __init__(self, channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> None:
         self.lost: Verdicts
         """What is lost wherever the AGV is, shape (N,)."""
-        self.lost, self._state = Air(seed, steps, ts).fates(channel, stream)
+        self.lost, self._state = ChannelRealisation(seed, steps, ts).fates(channel, stream)
         self._cause = np.full(steps, channel.model)
         if channel.entries or channel.lifetime < math.inf:  # which are causes of their own
             relay = Channel(channel, seed, stream, ts)
             causes = {k: relay.judge(k).cause for k in np.flatnonzero(self.lost).tolist()}
             self._cause = np.array([causes.get(k, channel.model) for k in range(steps)])
         self.is_direct = channel.is_direct
-        self.marks: Marks = blank(steps)
+        self.marks: LinkTrace = empty_trace(steps)
         """To be filled by the loop, if the link is not direct."""
         if self.is_direct:
             k = np.arange(steps)
@@ -37,10 +37,10 @@ class SimulatedLink:
         self._asked = channel, seed, stream, ts
 
     @functools.cached_property
-    def way(self) -> Way:
+    def way(self) -> LinkInputs:
         """What is needed to ask it in the loop."""
         channel, seed, stream, ts = self._asked
-        return way_of(channel, seed, stream, self.lost, draws(channel, seed, stream, 0, len(self.lost)), ts)
+        return link_inputs(channel, seed, stream, self.lost, draws(channel, seed, stream, 0, len(self.lost)), ts)
 
     def slots(self, count: int) -> LinkSlots:
         """The first `count` slots."""

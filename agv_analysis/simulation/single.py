@@ -9,8 +9,8 @@ import numpy as np
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.link_loop import history_on_air
-from agv_analysis.simulation.loop import Case, Rows, Settings, at_rest, history
+from agv_analysis.simulation.link_loop import history_over_links
+from agv_analysis.simulation.loop import Rows, RunInputs, Settings, at_rest, history
 from agv_analysis.simulation.noise import measurements, normals
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.simulated_link import SimulatedLink
@@ -39,7 +39,7 @@ def simulate(scenario: Scenario) -> Run:
     noise = numbers(normals(plant.seed, NOISE, steps)) if plant.is_noisy else None
     slip = numbers(normals(plant.seed, SLIP, steps)) if plant.slip_noise > 0.0 else None
     start, lost = at_rest(*plant.initial_pose), (numbers(up.lost), numbers(down.lost))
-    rows, done = _drive(numbers(reference), Case(*lost, start, settings, noise, slip), up, down)
+    rows, done = _drive(numbers(reference), RunInputs(*lost, start, settings, noise, slip), up, down)
     pose, k = rows[:done, 0:3], np.arange(done)
     return Run(
         scenario=scenario,
@@ -59,7 +59,7 @@ def simulate(scenario: Scenario) -> Run:
     )
 
 
-def _drive(reference: Rows, case: Case, up: SimulatedLink, down: SimulatedLink) -> tuple[Floats, int]:
+def _drive(reference: Rows, case: RunInputs, up: SimulatedLink, down: SimulatedLink) -> tuple[Floats, int]:
     """X_c, eps and u of a run's slots, shape (N, 8), and the number of slots until it ended; the links get their marks.
 
     Where a message that is not lost is there at once, verdicts known beforehand are all that is needed of the radio.
@@ -67,7 +67,7 @@ def _drive(reference: Rows, case: Case, up: SimulatedLink, down: SimulatedLink) 
     rows = np.empty((len(reference), 8))
     if up.is_direct and down.is_direct:
         return rows, compiled(history)(reference, case, rows, np.empty(len(rows), dtype=np.int64))
-    return rows, compiled(history_on_air)(reference, case, up.way, down.way, up.marks, down.marks, rows)
+    return rows, compiled(history_over_links)(reference, case, up.way, down.way, up.marks, down.marks, rows)
 
 
 def steps_of(scenario: Scenario) -> int:

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 
 from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.vehicle.motion import plant_step
+from agv_plant.vehicle.motion import integrate
 from agv_plant.vehicle.unicycle import euler_step
 
 
@@ -26,7 +26,7 @@ def next_error(
 
     The AGV along the arc or by Euler's step, the reference by the latter, as it is defined.
     """
-    x, y, theta = plant_step(arc, 0.0, 0.0, 0.0, v, w, ts)
+    x, y, theta = integrate(arc, 0.0, 0.0, 0.0, v, w, ts)
     x_r, y_r, theta_r = euler_step(x_e, y_e, theta_e, v_r, w_r, ts)
     return tracking_error(x_r, y_r, theta_r, x, y, theta)
 

@@ -26,12 +26,14 @@ def kind_of(model: str) -> int:
     return PLACED.index(model) if model in PLACED else EVERYWHERE
 
 
-def verdict_at(kind: int, floor: Table, level: float, other: float, u: float, x: float, y: float) -> tuple[bool, float]:
+def verdict_at(
+    kind: int, spatial_table: Table, level: float, other: float, u: float, x: float, y: float
+) -> tuple[bool, float]:
     """Is a message lost that is sent at the place (x, y) [m], and the channel's gain there [dB], NaN if it has none.
 
     `kind` is COVERAGE_HOLE or RAYLEIGH, `level` and `other` are its two levels, `u` is uniform in [0, 1).
     """
     if kind == RAYLEIGH:
-        gain = fading_gain(x, y, floor)
+        gain = fading_gain(x, y, spatial_table)
         return rayleigh(gain, level), gain
-    return coverage_hole(u, is_in_hole(x, y, floor), level, other), math.nan
+    return coverage_hole(u, is_in_hole(x, y, spatial_table), level, other), math.nan

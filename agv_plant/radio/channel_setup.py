@@ -43,7 +43,7 @@ def _with(channel: ChannelParameters, name: str, value: float) -> ChannelParamet
     return replace(channel, **{name: value})
 
 
-def floor_of(channel: ChannelParameters, seed: int, stream: str) -> list[list[float]]:
+def spatial_table_of(channel: ChannelParameters, seed: int, stream: str) -> list[list[float]]:
     """What the channel's model needs to know of the floor: rows of five numbers.
 
     `correlation` is the coefficient of correlation between the complex gains of a fading downlink and uplink.

@@ -17,7 +17,7 @@ from agv_plant.channels.position_dependent import NOWHERE, kind_of, verdict_at
 from agv_plant.channels.registry import SHARED, TRACE, ChannelError, find_model
 from agv_plant.channels.trace import TraceError, load_trace, trace
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.channel_setup import UPLINK, Segment, floor_of, levels_of, segments_of
+from agv_plant.radio.channel_setup import UPLINK, Segment, levels_of, segments_of, spatial_table_of
 from agv_plant.radio.delay import EXPIRED, delays_of, whole_slots
 from agv_plant.radio.schedule import OUTAGE, is_scripted
 from agv_plant.radio.shared_uplink import SCHEDULERS, serve, stream_of
@@ -107,7 +107,7 @@ class Channel:
         self.parameters = parameters
         measured = parameters.model == TRACE
         self._kind = kind_of(parameters.model)
-        self._floor = floor_of(parameters, seed, stream) if parameters.is_placed else []
+        self._spatial_table = spatial_table_of(parameters, seed, stream) if parameters.is_placed else []
         self._trace = load_trace(parameters.trace_file) if measured else ()
         self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
         self._random = _in_blocks(lambda first, count: draws(self.parameters, seed, stream, first, count))
@@ -159,7 +159,7 @@ class Channel:
 
     def _by_place(self, k: int, x: float, y: float) -> Verdict:
         levels, u = levels_of(self._segment(k).channel), self._random.at(k)[0]
-        lost, gain = verdict_at(self._kind, self._floor, *levels, u, x, y)
+        lost, gain = verdict_at(self._kind, self._spatial_table, *levels, u, x, y)
         return Verdict(lost, self.parameters.model if lost else "", GOOD, gain)
 
     def _by_slot(self, k: int) -> Verdict:

@@ -64,14 +64,12 @@ def move(motion: Motion, v: float, w: float, n_left: float, n_right: float, body
         )
         v_true, w_true = over_ground(body.speed_scale * v_driven, w_driven, s_left, s_right, body.track_width)
         beta = side_slip(v_true, w_true, body.skid)
-        x, y, course = plant_step(body.arc, x, y, theta + beta, v_true, w_true, dt)
+        x, y, course = integrate(body.arc, x, y, theta + beta, v_true, w_true, dt)
         theta = course - beta
     return Motion(x, y, theta, v_driven, w_driven, a)
 
 
-def plant_step(
-    arc: bool, x: float, y: float, theta: float, v: float, w: float, ts: float
-) -> tuple[float, float, float]:
+def integrate(arc: bool, x: float, y: float, theta: float, v: float, w: float, ts: float) -> tuple[float, float, float]:
     """One sampling period by the one or the other integration."""
     if arc:
         return arc_step(x, y, theta, v, w, ts)

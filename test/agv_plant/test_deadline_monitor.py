@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_plant.deadline_monitor import Punctuality
+from agv_plant.deadline_monitor import DeadlineMonitor
 
 PERIOD = 5_000_000
 
 
-def ticked(*ticks: int, start: int = 0) -> Punctuality:
-    punctuality = Punctuality(PERIOD)
-    punctuality.start(start)
+def ticked(*ticks: int, start: int = 0) -> DeadlineMonitor:
+    deadline_monitor = DeadlineMonitor(PERIOD)
+    deadline_monitor.start(start)
     for tick in ticks:
-        punctuality.tick(tick)
-    return punctuality
+        deadline_monitor.tick(tick)
+    return deadline_monitor
 
 
 def test_nothing_to_say_before_the_first_tick() -> None:
@@ -32,9 +32,9 @@ def test_a_perfect_loop() -> None:
 
 
 def test_a_tick_belongs_to_the_nearest_instant() -> None:
-    punctuality = ticked()
-    assert [punctuality.tick(round(at * PERIOD)) for at in (0.49, 0.51, 1.49, 1.51, 3.2)] == [0, 1, 1, 2, 3]
-    assert punctuality.missed == 0
+    deadline_monitor = ticked()
+    assert [deadline_monitor.tick(round(at * PERIOD)) for at in (0.49, 0.51, 1.49, 1.51, 3.2)] == [0, 1, 1, 2, 3]
+    assert deadline_monitor.missed == 0
 
 
 def test_every_instant_without_a_tick_is_a_missed_deadline() -> None:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_plant.zero_order_hold import HeldCommand
+from agv_plant.zero_order_hold import ZeroOrderHold
 from agv_ros.codec import Command
 
 TIMEOUT = 100
@@ -17,14 +17,14 @@ def stopped(stamp_ns: int) -> Command:
 
 
 def test_standing_still_before_the_first_command() -> None:
-    held = HeldCommand(TIMEOUT)
+    held = ZeroOrderHold(TIMEOUT)
     assert held.at(0) == stopped(0)
     assert held.at(10**12) == stopped(10**12)
     assert held.stops == 0
 
 
 def test_obeyed_until_it_is_older_than_the_limit() -> None:
-    held = HeldCommand(TIMEOUT)
+    held = ZeroOrderHold(TIMEOUT)
     held.at(50)
     held.offer(Command(50, 1.0, 2.0))
     assert held.at(50 + TIMEOUT) == Command(50, 1.0, 2.0)
@@ -33,7 +33,7 @@ def test_obeyed_until_it_is_older_than_the_limit() -> None:
 
 
 def test_the_agv_goes_on_when_commands_return_and_each_stop_counts_once() -> None:
-    held = HeldCommand(TIMEOUT)
+    held = ZeroOrderHold(TIMEOUT)
     for start in (0, 1000, 2000):
         held.at(start)
         held.offer(Command(start, 1.0, 0.0))
@@ -43,7 +43,7 @@ def test_the_agv_goes_on_when_commands_return_and_each_stop_counts_once() -> Non
 
 
 def test_an_older_command_after_a_newer_one_is_not_obeyed() -> None:
-    held = HeldCommand(TIMEOUT)
+    held = ZeroOrderHold(TIMEOUT)
     held.at(20)
     held.offer(Command(20, 2.0, 0.0))
     held.offer(Command(10, 1.0, 0.0))
@@ -55,7 +55,7 @@ def test_an_older_command_after_a_newer_one_is_not_obeyed() -> None:
 
 @pytest.mark.parametrize("ahead", [1, 10**18])
 def test_a_command_from_the_future_neither_moves_nor_blinds_the_agv(ahead: int) -> None:
-    held = HeldCommand(TIMEOUT)
+    held = ZeroOrderHold(TIMEOUT)
     held.offer(Command(ahead, 9.0, 0.0))
     assert held.at(0) == stopped(0)
     held.offer(Command(0, 1.0, 0.0))
@@ -72,7 +72,7 @@ def test_a_command_from_the_future_neither_moves_nor_blinds_the_agv(ahead: int) 
 @given(st.lists(st.tuples(st.integers(0, 40), st.lists(st.integers(-300, 50), max_size=3)), max_size=30))
 def test_against_the_rules_read_out(story: list[tuple[int, list[int]]]) -> None:
     """At each instant obey the newest stamp offered so far that was not ahead of the clock, unless it is too old."""
-    held, now, heard, stops, was_stopped = HeldCommand(TIMEOUT), 1000, [], 0, False
+    held, now, heard, stops, was_stopped = ZeroOrderHold(TIMEOUT), 1000, [], 0, False
     held.at(now)
     for pause, offers in story:
         for delay in offers:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_ros.codec import DELIVERED, LOST, Slot
-from agv_ros.message_sync import MOST_WAITING, Joined, SlotJoin
+from agv_ros.message_sync import MOST_WAITING, Joined, MessageSync
 
 START, TS = 1_000_000_000, 5_000_000
 
@@ -55,7 +55,7 @@ class Schedule(NamedTuple):
         return [(t(k), None if j is None else Message(t(j), self.run)) for k, j in enumerate(usable)]
 
 
-def feed(join: SlotJoin[Message], event: Message | int | Slot) -> Iterator[tuple[int, Message | None]]:
+def feed(join: MessageSync[Message], event: Message | int | Slot) -> Iterator[tuple[int, Message | None]]:
     joined: list[Joined[Message]]
     if isinstance(event, Slot):
         joined = join.add_slot(event)
@@ -86,7 +86,7 @@ any_fates = st.text(alphabet="..x!", min_size=1, max_size=40)
 @settings(deadline=None, derandomize=True, max_examples=300)
 @given(first_delivered, turns)
 def test_every_order_of_arrival_has_the_same_answers(fates: str, order: list[bool]) -> None:
-    schedule, join = Schedule(fates), SlotJoin[Message](START)
+    schedule, join = Schedule(fates), MessageSync[Message](START)
     events = list(merged(order, schedule.messages(), schedule.slots()))
     assert [answer for event in events for answer in feed(join, event)] == schedule.answers()
     assert (join.outdated, join.unanswered) == (0, 0)
@@ -95,7 +95,7 @@ def test_every_order_of_arrival_has_the_same_answers(fates: str, order: list[boo
 @settings(deadline=None, derandomize=True, max_examples=300)
 @given(any_fates.filter(lambda fates: fates[0] != "x"), turns)
 def test_a_run_may_begin_with_a_message_that_cannot_be_used(fates: str, order: list[bool]) -> None:
-    schedule, join = Schedule(fates), SlotJoin[Message](START)
+    schedule, join = Schedule(fates), MessageSync[Message](START)
     events = merged(order, schedule.messages(), schedule.slots())
     assert [answer for event in events for answer in feed(join, event)] == schedule.answers()
 
@@ -104,7 +104,7 @@ def test_a_run_may_begin_with_a_message_that_cannot_be_used(fates: str, order: l
 @given(first_delivered, first_delivered, turns, turns)
 def test_a_second_run_hears_nothing_of_the_first(a: str, b: str, order: list[bool], again: list[bool]) -> None:
     """The plant is started again: both topics begin anew, either may be first."""
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     for schedule, turns_of_run in ((Schedule(a, 1), order), (Schedule(b, 2), again)):
         events = merged(turns_of_run, schedule.messages(), schedule.slots())
         assert [answer for event in events for answer in feed(join, event)] == schedule.answers()
@@ -114,7 +114,7 @@ def test_a_second_run_hears_nothing_of_the_first(a: str, b: str, order: list[boo
 @given(st.text(alphabet=".x", min_size=1, max_size=30), st.integers(0, 1000), turns)
 def test_a_node_that_joins_a_running_loop(fates: str, k: int, order: list[bool]) -> None:
     """Slots from step k on; what was delivered before is unknown, until the first fresh message."""
-    join = SlotJoin[Message](START - (k + 1) * TS)
+    join = MessageSync[Message](START - (k + 1) * TS)
     schedule = Schedule("." + fates)
     events = merged(order, schedule.messages()[1:], schedule.slots()[1:])
     answers = [answer for event in events for answer in feed(join, event)]
@@ -124,7 +124,7 @@ def test_a_node_that_joins_a_running_loop(fates: str, k: int, order: list[bool])
 
 @pytest.mark.parametrize("slot_first", [True, False])
 def test_what_a_run_left_behind_is_not_taken_for_the_next_one_s(slot_first: bool) -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     begin: list[Message | Slot] = [Message(t(0), 1), Slot(t(0), t(0), DELIVERED)]
     left_behind: list[Message | Slot] = [*(begin[::-1] if slot_first else begin), Message(t(2), 1)]
     for event in left_behind:  # slot 2 never comes: the run ends
@@ -136,7 +136,7 @@ def test_what_a_run_left_behind_is_not_taken_for_the_next_one_s(slot_first: bool
 
 
 def test_a_run_that_begins_with_an_unusable_message_does_not_go_on_with_the_last_run_s() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     events: list[Message | int | Slot] = [Message(t(0)), Slot(t(0), t(0), DELIVERED), t(0)]
     for event in events:
         list(feed(join, event))
@@ -144,7 +144,7 @@ def test_a_run_that_begins_with_an_unusable_message_does_not_go_on_with_the_last
 
 
 def test_a_slot_waits_for_the_message_that_it_names() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     assert not join.add_slot(Slot(t(0), t(0), DELIVERED))
     assert not join.add_slot(Slot(t(1), t(0), LOST))
     joined = join.add_message(Message(t(0)))
@@ -152,12 +152,12 @@ def test_a_slot_waits_for_the_message_that_it_names() -> None:
 
 
 def test_a_slot_before_any_message_is_answered_with_none() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     assert [one.message for one in join.add_slot(Slot(t(0), 0, LOST))] == [None]
 
 
 def test_a_slot_whose_message_never_comes_is_passed_over_and_counted() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     join.add_message(Message(t(0)))
     join.add_slot(Slot(t(0), t(0), DELIVERED))
     assert not join.add_slot(Slot(t(1), t(1), DELIVERED))
@@ -171,7 +171,7 @@ def test_a_slot_whose_message_never_comes_is_passed_over_and_counted() -> None:
 
 
 def test_a_repeated_message_changes_nothing_and_a_repeated_slot_is_answered_alike() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     for k in range(3):
         join.add_message(Message(t(k)))
         join.add_message(Message(t(k)))
@@ -181,7 +181,7 @@ def test_a_repeated_message_changes_nothing_and_a_repeated_slot_is_answered_alik
 
 
 def test_step_0_repeated_is_answered_again_and_the_loop_goes_on() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     for _ in range(3):
         join.add_message(Message(t(0)))
         assert [one.message for one in join.add_slot(Slot(t(0), t(0), DELIVERED))] == [Message(t(0))]
@@ -193,7 +193,7 @@ def test_step_0_repeated_is_answered_again_and_the_loop_goes_on() -> None:
 
 
 def test_a_usable_message_stands_against_a_rejected_one_of_the_same_stamp() -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     join.add_message(Message(t(0)))
     join.reject(t(0))
     assert [one.message for one in join.add_slot(Slot(t(0), t(0), DELIVERED))] == [Message(t(0))]
@@ -201,7 +201,7 @@ def test_a_usable_message_stands_against_a_rejected_one_of_the_same_stamp() -> N
 
 @pytest.mark.parametrize("k", [0, 5, 10**9])
 def test_a_stray_rejected_message_does_no_harm(k: int) -> None:
-    join = SlotJoin[Message](START)
+    join = MessageSync[Message](START)
     for step in range(4):
         join.add_message(Message(t(step)))
         if step == 2:
@@ -211,7 +211,7 @@ def test_a_stray_rejected_message_does_no_harm(k: int) -> None:
 
 
 def test_a_dead_topic_does_not_let_the_other_fill_the_memory() -> None:
-    slots_only, messages_only = SlotJoin[Message](START), SlotJoin[Message](START)
+    slots_only, messages_only = MessageSync[Message](START), MessageSync[Message](START)
     for k in range(MOST_WAITING + 50):
         assert not slots_only.add_slot(Slot(t(k), t(k), DELIVERED))
         assert not messages_only.add_message(Message(t(k)))
@@ -224,7 +224,7 @@ def test_a_dead_topic_does_not_let_the_other_fill_the_memory() -> None:
 
 def test_a_relay_that_was_started_again_leaves_what_is_held() -> None:
     """It names no message before it has passed one on."""
-    join: SlotJoin[Message] = SlotJoin(START)
+    join: MessageSync[Message] = MessageSync(START)
     assert join.add_slot(Slot(t(0), 0, LOST)) == [Joined(Slot(t(0), 0, LOST), None)]
     join.add_message(Message(t(1)))
     join.add_slot(Slot(t(1), t(1), DELIVERED))

@@ -19,8 +19,8 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from agv_analysis.explore.background_criteria import Newest, lap_beside, lap_rows
-from agv_analysis.explore.response import answer, told, under_the_outages_of
+from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside, lap_rows
+from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
 from agv_analysis.report.page import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
@@ -79,16 +79,16 @@ def test_what_is_not_allowed_is_refused_with_the_reason(base: Scenario, more: st
 def test_the_pinned_setting_meets_the_same_outages(base: Scenario) -> None:
     pinned = scenario_of(base, {**values_of(base), "kx": 5, "model": "perfect", "seed": 3})
     now = scenario_of(base, {**values_of(base), "kx": 40, "seed": 8})
-    runs = simulate(now), simulate(under_the_outages_of(pinned, now))
+    runs = simulate(now), simulate(with_channel_of(pinned, now))
     np.testing.assert_array_equal(runs[0].lost, runs[1].lost)
     assert runs[0].lost.any()
     assert runs[1].scenario.controller == pinned.controller
     slower = scenario_of(base, {**values_of(base), "ts": 10})
-    assert simulate(under_the_outages_of(slower, now)).ts == 0.01
+    assert simulate(with_channel_of(slower, now)).ts == 0.01
 
 
 def test_both_runs_are_drawn(base: Scenario) -> None:
-    found = answer(base, dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0)))
+    found = respond(base, dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0)))
     assert [trace["name"] for trace in found.track["data"]] == ["reference", "AGV", "pose lost", "pinned"]
     assert [trace["name"] for trace in found.time["data"]].count("pinned") == 3
     assert all(len(row) == 3 and row[2] for row in found.rows)
@@ -115,7 +115,7 @@ def test_of_calls_that_wait_only_the_newest_is_made(tmp_path: Path) -> None:
     pipe, file = tmp_path / "pipe", tmp_path / "file"
     os.mkfifo(pipe)
     file.write_text("later")
-    newest: Newest[str] = Newest(Path.read_text)
+    newest: LatestOnlyWorker[str] = LatestOnlyWorker(Path.read_text)
     try:
         with ThreadPoolExecutor(3) as threads:
             first = threads.submit(newest, pipe)
@@ -131,7 +131,7 @@ def test_of_calls_that_wait_only_the_newest_is_made(tmp_path: Path) -> None:
 
 
 def test_a_call_waits_whether_a_newer_one_comes(tmp_path: Path) -> None:
-    newest: Newest[str] = Newest(Path.read_text, rest=600.0)
+    newest: LatestOnlyWorker[str] = LatestOnlyWorker(Path.read_text, rest=600.0)
     with ThreadPoolExecutor(2) as threads:
         calls = [threads.submit(newest, tmp_path / "file") for _ in range(2)]  # there is no such file
         done, waits = wait(calls, timeout=60.0, return_when=FIRST_COMPLETED)
@@ -144,7 +144,7 @@ def test_the_presets_tell_the_story(base: Scenario) -> None:
     def late(key: str) -> tuple[float, str]:
         run = simulate(scenario_of(base, preset_values(base, key)))
         distance = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
-        return float(distance[-1]), dict(told(run))["Paper's test"]
+        return float(distance[-1]), dict(summary_rows(run))["Paper's test"]
 
     assert list(PRESETS) == ["paper", "missed", "predicted"]
     assert late("paper")[0] < 1e-6
@@ -195,12 +195,12 @@ def address(base: Scenario) -> Iterator[str]:
     import threading
 
     from agv_analysis.explore.app import HOST, build
-    from agv_analysis.explore.background_criteria import Newest, lap_beside
+    from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside
 
     pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
     from werkzeug.serving import make_server
 
-    lap = Newest(lap_beside)
+    lap = LatestOnlyWorker(lap_beside)
     server = make_server(HOST, 0, build(base, lap).server, threaded=True)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -386,9 +386,9 @@ def ask_for_the_lap(address: str, base: Scenario) -> None:
     state = [{"id": key, "property": "value", "value": values[key]} for key in KEYS]
     state.append({"id": "pinned", "property": "data", "value": None})
     inputs = [{"id": "problem", "property": "children", "value": ""}]
-    with urlopen(f"{address}_dash-dependencies") as answer:
+    with urlopen(f"{address}_dash-dependencies") as respond:
         [output] = [
-            one["output"] for one in json.load(answer) if one["inputs"] == [{"id": "problem", "property": "children"}]
+            one["output"] for one in json.load(respond) if one["inputs"] == [{"id": "problem", "property": "children"}]
         ]
     outputs = [
         dict(zip(("id", "property"), name.split(".", 1), strict=True)) for name in output.strip(".").split("...")

@@ -19,7 +19,7 @@ from agv_analysis.recordings.recording import read_run
 from agv_analysis.runtime.fleet import Vehicle, instability, judge, vehicle_names, vehicle_scenarios
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, delay_draws, losses
 from agv_ros.parameters import ParameterError
@@ -83,9 +83,9 @@ def test_a_vehicle_s_own_channel_is_the_same_simulated(model: str) -> None:
     channel = ChannelParameters(
         model=model, p=0.3, r=0.4, vehicles=5, vehicle=4, delay=0.01, jitter=0.02, lifetime=0.02
     )
-    assert (losses(channel, 7, "downlink", 500) == Air(7, 500).verdicts(channel, "downlink")).all()
-    relay, way = Channel(channel, 7, "downlink"), Air(7, 500).way(channel, "downlink")
-    lost = Air(7, 500).verdicts(channel, "downlink")
+    assert (losses(channel, 7, "downlink", 500) == ChannelRealisation(7, 500).verdicts(channel, "downlink")).all()
+    relay, way = Channel(channel, 7, "downlink"), ChannelRealisation(7, 500).way(channel, "downlink")
+    lost = ChannelRealisation(7, 500).verdicts(channel, "downlink")
     waits = [math.ceil(relay.delays(k)[0] - 1e-9) for k in range(500) if not lost[k]]
     assert np.asarray(way.waits)[~lost].tolist() == waits
 

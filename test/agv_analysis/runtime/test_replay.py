@@ -36,7 +36,7 @@ from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import load_trace
 from agv_ros.codec import DELIVERED, Pose, Slot, encode_clock, stamp_of
 from agv_ros.errors import UserError
-from agv_ros.message_sync import SlotJoin
+from agv_ros.message_sync import MessageSync
 from agv_ros.stamps import Grid
 
 if TYPE_CHECKING:
@@ -326,7 +326,7 @@ def test_a_slot_is_answered_however_often_it_is_sent(first: int) -> None:
         sent = [next(pose) if i in places else next(slot) for i in range(6)]
         if min(sent.index(after), sent.index(slots[2])) < max(sent.index(now), sent.index(slots[0])):
             continue
-        join: SlotJoin[Pose] = SlotJoin(grid.start_ns)
+        join: MessageSync[Pose] = MessageSync(grid.start_ns)
         answers: dict[int, Pose | None] = {}
         for message in (*sent, after, slots[2]):
             for found in join.add_slot(message) if isinstance(message, Slot) else join.add_message(message):

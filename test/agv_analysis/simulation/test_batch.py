@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import STATISTICS, simulate, simulate_batch
 from agv_analysis.simulation.batch import _Batch
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
 from agv_ros.errors import UserError
@@ -45,7 +45,7 @@ def scenarios(*gains: float, duration: float = 2.0) -> list[Scenario]:
 def test_verdicts_are_those_of_the_relay(channel: ChannelParameters) -> None:
     for seed, stream in ((1, "uplink"), (2**62, "downlink")):
         expected = losses(channel, seed, stream, 9000)  # more than two of the relay's blocks
-        assert np.array_equal(Air(seed, 9000).verdicts(channel, stream), expected)
+        assert np.array_equal(ChannelRealisation(seed, 9000).verdicts(channel, stream), expected)
 
 
 def test_the_number_of_workers_changes_nothing() -> None:

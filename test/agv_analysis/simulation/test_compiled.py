@@ -13,7 +13,7 @@ import pytest
 from agv_analysis.compiled import compiled
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.simulation.loop import Case, at_rest, history, statistics, statistics_of_two
+from agv_analysis.simulation.loop import RunInputs, at_rest, history, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
@@ -51,8 +51,8 @@ def test_compiled_and_plain_agree_to_the_last_bit(settings: tuple[str, ...]) -> 
     steps = len(run)
     start, numbers = at_rest(*run.scenario.plant.initial_pose), settings_of(run.scenario)
     reference = run.reference.tolist()
-    plain = Case(run.lost.tolist(), run.downlink_lost.tolist(), start, numbers)
-    fast = Case(run.lost, run.downlink_lost, start, numbers)
+    plain = RunInputs(run.lost.tolist(), run.downlink_lost.tolist(), start, numbers)
+    fast = RunInputs(run.lost, run.downlink_lost, start, numbers)
     rows, n_ul = np.empty((steps, 8)), np.empty(steps, dtype=np.int64)
     assert history(reference, plain, rows, n_ul) == steps
     assert rows.tobytes() == np.hstack([run.pose, run.error, run.command]).tobytes()

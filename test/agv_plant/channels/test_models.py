@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chisquare, norm
 
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.channels import MODELS
 from agv_plant.channels.bernoulli import bernoulli
 from agv_plant.channels.burst import burst
@@ -302,4 +302,4 @@ def test_a_downlink_of_the_same_fate_loses_what_the_uplink_loses(model: str) -> 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_the_simulation_draws_the_same_correlated_numbers(stream: str, share: float) -> None:
     channel = dataclasses.replace(EVERY_MODEL["gilbert_elliott"], correlation=share)
-    assert (Air(7, 9000).verdicts(channel, stream) == losses(channel, 7, stream, 9000)).all()
+    assert (ChannelRealisation(7, 9000).verdicts(channel, stream) == losses(channel, 7, stream, 9000)).all()

@@ -21,8 +21,8 @@ from agv_analysis.compiled import compiled
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.batch import TWIN_OFFSET
-from agv_analysis.simulation.channel_outcomes import Air
-from agv_analysis.simulation.link_loop import blank, listen
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.simulation.link_loop import empty_trace, listen
 from agv_plant.channels.coverage_hole import is_in_hole, rows_of
 from agv_plant.channels.position_dependent import PLACED
 from agv_plant.channels.rayleigh import SPEED_OF_LIGHT, fades_per_metre, fading_gain, loss_rate
@@ -195,8 +195,10 @@ def test_speed_makes_fades_shorter_and_not_rarer(speed: float) -> None:
     way = np.arange(steps) * speed * ts
     outages, rates = [], []
     for seed in range(12):
-        marks = blank(steps)
-        compiled(listen)(Air(seed, steps, ts).way(c, "uplink"), marks, np.column_stack([way, 0.5 * np.ones(steps)]))
+        marks = empty_trace(steps)
+        compiled(listen)(
+            ChannelRealisation(seed, steps, ts).way(c, "uplink"), marks, np.column_stack([way, 0.5 * np.ones(steps)])
+        )
         outages.append(np.count_nonzero(~marks.lost[:-1] & marks.lost[1:]))
         rates.append(np.mean(marks.lost))
     expected = fades_per_metre(CARRIER, 6.0) * speed * ts * steps
@@ -244,8 +246,8 @@ def test_the_relay_s_verdicts_are_the_simulation_s(model: str) -> None:
     steps = 3000
     places = np.column_stack([np.linspace(-3.0, 3.0, steps), np.linspace(2.0, 8.0, steps)])
     for stream in ("uplink", "downlink"):
-        marks, channel = blank(steps), Channel(PLACES[model], 9, stream)
-        compiled(listen)(Air(9, steps).way(PLACES[model], stream), marks, places)
+        marks, channel = empty_trace(steps), Channel(PLACES[model], 9, stream)
+        compiled(listen)(ChannelRealisation(9, steps).way(PLACES[model], stream), marks, places)
         alone = [channel.judge(k, *place) for k, place in enumerate(places.tolist())]
         assert np.array_equal(marks.lost, [one.lost for one in alone])
         np.testing.assert_allclose(marks.gain, [one.gain for one in alone], rtol=0.0, atol=1e-9)
@@ -260,8 +262,8 @@ def test_seeds_and_streams_differ(model: str) -> None:
     way = np.column_stack([np.linspace(-10.0, 10.0, steps), np.full(steps, 5.0)])
 
     def lost(seed: int, stream: str) -> list[bool]:
-        marks = blank(steps)
-        compiled(listen)(Air(seed, steps).way(PLACES[model], stream), marks, way)
+        marks = empty_trace(steps)
+        compiled(listen)(ChannelRealisation(seed, steps).way(PLACES[model], stream), marks, way)
         found: list[bool] = marks.lost.tolist()
         return found
 

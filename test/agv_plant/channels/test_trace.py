@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_analysis.scenario import load_scenario
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import TraceError, load_trace, parse_json_trace, parse_trace, trace
 from agv_plant.parameters import ChannelParameters
@@ -102,7 +102,7 @@ def test_the_simulation_s_verdicts_are_the_relay_s(measured: Path, end: str) -> 
     c = ChannelParameters(model="trace", trace_file=str(measured), trace_end=end)
     expected = MEASURED * 3 if end == "repeat" else MEASURED + [False] * 14
     assert losses(c, 1, "uplink", 21).tolist() == expected
-    assert Air(1, 21).verdicts(c, "downlink").tolist() == expected
+    assert ChannelRealisation(1, 21).verdicts(c, "downlink").tolist() == expected
     channel = Channel(c, 1, "uplink")
     assert [channel.lost(k) for k in reversed(range(21))] == expected[::-1]
 
@@ -111,7 +111,7 @@ def test_slot_0_is_never_lost(tmp_path: Path) -> None:
     (tmp_path / "all.csv").write_text("lost\n1\n1\n")
     c = ChannelParameters(model="trace", trace_file=str(tmp_path / "all.csv"))
     assert losses(c, 1, "uplink", 5).tolist() == [False, True, True, True, True]
-    assert Air(1, 5).verdicts(c, "uplink").tolist() == [False, True, True, True, True]
+    assert ChannelRealisation(1, 5).verdicts(c, "uplink").tolist() == [False, True, True, True, True]
 
 
 # -- runs --------------------------------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from scipy.stats import kstest
 
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.simulation.channel_outcomes import Air
-from agv_analysis.simulation.link_loop import Marks, blank, listen
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.simulation.link_loop import LinkTrace, empty_trace, listen
 from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.margins import left_out
 from agv_analysis.stability.verdict import ASYMPTOTIC, UNKNOWN, UNSTABLE
@@ -116,7 +116,7 @@ def test_a_copy_may_come_in_time_where_the_message_does_not() -> None:
     c = ChannelParameters(delay=0.02, jitter=0.02, lifetime=0.02, duplicate=1.0)
     lost = losses(c, 1, "uplink", 20_000, TS)
     assert abs(lost.mean() - 0.25) < 5.0 * math.sqrt(0.25 * 0.75 / 20_000)
-    assert np.array_equal(Air(1, 20_000, TS).verdicts(c, "uplink"), lost)
+    assert np.array_equal(ChannelRealisation(1, 20_000, TS).verdicts(c, "uplink"), lost)
 
 
 def test_a_new_run_hears_nothing_of_what_was_under_way() -> None:
@@ -134,9 +134,9 @@ def test_a_link_counts_the_late_ones_and_the_copies() -> None:
     assert link.delayed == sum(min(delay for delay in both if delay >= 0.0) > 0.0 for both in kept)
 
 
-def blank_run(c: ChannelParameters, steps: int, seed: int = 1) -> Marks:
-    marks = blank(steps)
-    listen(Air(seed, steps, TS).way(c, "uplink"), marks, [[0.0, 0.0]] * steps)
+def blank_run(c: ChannelParameters, steps: int, seed: int = 1) -> LinkTrace:
+    marks = empty_trace(steps)
+    listen(ChannelRealisation(seed, steps, TS).way(c, "uplink"), marks, [[0.0, 0.0]] * steps)
     return marks
 
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from agv_analysis.cli import main
 from agv_analysis.link.markov_channel import chain_of
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, losses
 from agv_plant.radio.schedule import OUTAGE, is_scripted
@@ -85,7 +85,7 @@ SCHEDULES = {
 
 @pytest.mark.parametrize("c", SCHEDULES.values(), ids=SCHEDULES)
 def test_the_simulation_follows_it_as_the_relay_does(c: ChannelParameters) -> None:
-    assert np.array_equal(Air(5, STEPS, TS).verdicts(c, "uplink"), losses(c, 5, "uplink", STEPS, TS))
+    assert np.array_equal(ChannelRealisation(5, STEPS, TS).verdicts(c, "uplink"), losses(c, 5, "uplink", STEPS, TS))
 
 
 @pytest.mark.parametrize("c", SCHEDULES.values(), ids=SCHEDULES)
