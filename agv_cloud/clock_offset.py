@@ -13,7 +13,7 @@ No clock, no thread, no ROS in here: poses and instants go in.
 
 from __future__ import annotations
 
-from agv_ros.codec import Pose
+from agv_ros.messages import StampedPose
 from agv_ros.stamps import NS_PER_S
 
 WINDOW_NS = 10 * NS_PER_S
@@ -35,7 +35,7 @@ class FreshestPose:
 
     def __init__(self, ts_ns: int) -> None:
         self._ts_ns = ts_ns
-        self.pose: Pose | None = None
+        self.pose: StampedPose | None = None
         self.first_ns = 0
         """Stamp of the first pose of the run."""
         self._least_ns = self._least_before_ns = self._window_since_ns = 0
@@ -53,7 +53,7 @@ class FreshestPose:
         """The AGV's time."""
         return now_ns - self.offset_ns
 
-    def offer(self, pose: Pose, now_ns: int) -> bool:
+    def offer(self, pose: StampedPose, now_ns: int) -> bool:
         """Take a pose that has just come; is it now the freshest one?"""
         ahead_ns = pose.stamp_ns - self.time(now_ns)
         if self.pose is None:
@@ -74,7 +74,7 @@ class FreshestPose:
         self.pose = pose
         return True
 
-    def _begin(self, pose: Pose, now_ns: int) -> None:
+    def _begin(self, pose: StampedPose, now_ns: int) -> None:
         self.pose, self.first_ns = pose, pose.stamp_ns
         self._least_ns = self._least_before_ns = now_ns - pose.stamp_ns
         self._window_since_ns = now_ns

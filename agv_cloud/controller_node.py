@@ -12,9 +12,10 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.control.plan import planned_commands
 from agv_cloud.parameters import ControllerParameters
-from agv_ros.codec import FRAME_AGV, Command, TrackingError, decode_error, encode_command, encode_twist
+from agv_ros.codec import decode_error, encode_command, encode_twist
 from agv_ros.executor import run_node
 from agv_ros.message_types import TWIST_STAMPED
+from agv_ros.messages import FRAME_AGV, Command, TrackingError
 from agv_ros.node import LoopNode
 from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
 

@@ -22,16 +22,10 @@ from agv_cloud.parameters import PATH, ErrorDetectorParameters
 from agv_cloud.reference.path_track import Curve, PathError, PathReference, PathTrack, Point
 from agv_cloud.reference.reference import Reference, ReferencePoint
 from agv_cloud.reference.thinned_path import path_points, thinned
-from agv_cloud.staleness import Posture, Prediction
+from agv_cloud.staleness import Prediction
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.codec import (
-    FRAME_MAP,
-    FRAME_REFERENCE,
-    InvalidMessageError,
-    Pose,
-    Slot,
-    TrackingError,
     decode_command,
     decode_odometry,
     decode_pose,
@@ -39,13 +33,22 @@ from agv_ros.codec import (
     encode_error,
     encode_pose,
     encode_slot,
-    quaternion_of_yaw,
     stamp_of,
 )
 from agv_ros.executor import run_node
 from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.message_types import ODOMETRY
+from agv_ros.messages import (
+    FRAME_MAP,
+    FRAME_REFERENCE,
+    InvalidMessageError,
+    Slot,
+    StampedPose,
+    TrackingError,
+    quaternion_of_yaw,
+)
 from agv_ros.node import LoopNode
+from agv_ros.pose import Pose
 from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
 from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
 from agv_ros.transforms import TransformBroadcaster
@@ -66,12 +69,12 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         super().__init__("error_detector", ErrorDetectorParameters, **node_options)
         is_path = self.settings.track == PATH
         self.reference: Reference | PathReference = PathReference() if is_path else Reference(self.settings)
-        self._join: MessageSync[Pose] = MessageSync(self.grid.start_ns)
+        self._join: MessageSync[StampedPose] = MessageSync(self.grid.start_ns)
         self._steps = Steps(self.grid)
         self._blind = 0
         self._predicts = self.settings.policy == "predict"
         self._prediction = self._new_prediction()
-        self._ready: deque[Joined[Pose]] = deque()
+        self._ready: deque[Joined[StampedPose]] = deque()
         self._answered = -1
         self._error_out = self.output(Odometry, "edge/error")
         plans = self.settings.plan_steps > 0
@@ -128,7 +131,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         if isinstance(self.reference, PathReference):
             self.reference.restart()
 
-    def _decode_pose(self, data: bytes) -> Pose:
+    def _decode_pose(self, data: bytes) -> StampedPose:
         return decode_odometry(data) if self._is_odometry else decode_pose(data)
 
     # -- along paths -------------------------------------------------------------------------------------------------
@@ -182,7 +185,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self.get_logger().info(f"path {self._paths}: {curve.length:.3f} m from ({x:.3f}, {y:.3f}) m on")
         self._show(thinned(track, track.steps))
 
-    def _reference_at(self, k: int, held: Posture) -> ReferencePoint:
+    def _reference_at(self, k: int, held: Pose) -> ReferencePoint:
         """The reference at step k; before the first path, that the AGV stands where it is held to be."""
         found = self.reference[k]
         return ReferencePoint(*held, 0.0, 0.0) if found is None else found
@@ -208,7 +211,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._prediction.add_command(self._steps.of(command.stamp_ns), command.v, command.w)
         self._answer([])
 
-    def _answer(self, ready: list[Joined[Pose]]) -> None:
+    def _answer(self, ready: list[Joined[StampedPose]]) -> None:
         self._ready.extend(ready)
         while self._ready and self._may_answer():
             self._answer_one(self._ready.popleft())
@@ -220,7 +223,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         k = self.grid.step(self._ready[0].slot.stamp_ns)
         return k - 1 != self._answered or self._prediction.has_command(k - 1)
 
-    def _answer_one(self, joined: Joined[Pose]) -> None:
+    def _answer_one(self, joined: Joined[StampedPose]) -> None:
         stamp_ns, pose = joined.slot.stamp_ns, joined.message
         if pose is None:
             self._blind += 1
@@ -282,9 +285,9 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
 
     # -- either way --------------------------------------------------------------------------------------------------
 
-    def _compare(self, k: int, taken: int, pose: Pose) -> None:
+    def _compare(self, k: int, taken: int, pose: StampedPose) -> None:
         """Publish the error of step k, as a pose tells it that was taken at step `taken`."""
-        stamp_ns, held = self.grid.stamp(k), Posture(pose.x, pose.y, pose.theta)
+        stamp_ns, held = self.grid.stamp(k), Pose(pose.x, pose.y, pose.theta)
         if self._predicts:
             held = self._prediction.at(k, taken, held)
         if isinstance(self.reference, PathReference):
@@ -296,13 +299,13 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         error = TrackingError(stamp_ns, *eps, now.v, now.w)
         if self._horizon_out is not None:
             self._horizon_out.publish(self._horizon(k, held))
-        posture = Pose(stamp_ns, now.x, now.y, now.theta)
+        posture = StampedPose(stamp_ns, now.x, now.y, now.theta)
         if self._reference_out is not None:
             self._reference_out.publish(encode_pose(posture))
         self._transforms.send(posture)
         self._error_out.publish(encode_error(error, self.settings.frame_prefix))
 
-    def _horizon(self, k: int, held: Posture) -> bytes:
+    def _horizon(self, k: int, held: Pose) -> bytes:
         """Speeds of the reference from step k on, as far as the controller plans."""
         points = (self._reference_at(k + ahead, held) for ahead in range(self.settings.plan_steps + 1))
         ahead = SpeedsAhead(self.grid.stamp(k), tuple((point.v, point.w) for point in points))

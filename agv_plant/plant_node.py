@@ -23,22 +23,13 @@ from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.parameters import PlantParameters
 from agv_plant.random_stream import normals_of
 from agv_plant.vehicle.motion import NOISE, SLIP, Motion, body_of, measured, move
-from agv_plant.vehicle.unicycle import State
 from agv_plant.zero_order_hold import ZeroOrderHold
-from agv_ros.codec import (
-    FRAME_AGV,
-    Command,
-    InvalidMessageError,
-    Pose,
-    decode_command,
-    decode_slot,
-    encode_clock,
-    encode_pose,
-    stamp_of,
-)
+from agv_ros.codec import decode_command, decode_slot, encode_clock, encode_pose, stamp_of
 from agv_ros.executor import run_node
 from agv_ros.message_sync import Joined, MessageSync
+from agv_ros.messages import FRAME_AGV, Command, InvalidMessageError, StampedPose
 from agv_ros.node import LoopNode
+from agv_ros.pose import Pose
 from agv_ros.speeds_codec import decode_speeds
 from agv_ros.stamps import to_nanoseconds
 from agv_ros.transforms import TransformBroadcaster
@@ -100,9 +91,9 @@ class PlantNode(LoopNode[PlantParameters]):
         self.poll(self._begin)
 
     @property
-    def state(self) -> State:
+    def state(self) -> Pose:
         """The true pose."""
-        return State(*self._motion[:3])
+        return Pose(*self._motion[:3])
 
     def _begin(self) -> bool:
         wanted = max(self.settings.wait_for_subscribers, self._lockstep)
@@ -124,17 +115,17 @@ class PlantNode(LoopNode[PlantParameters]):
         pose = self._measured_pose()
         self._clock_out.publish(encode_clock(stamp_ns))
         if self._truth_out is not None:
-            self._truth_out.publish(encode_pose(Pose(stamp_ns, *self.state)))
+            self._truth_out.publish(encode_pose(StampedPose(stamp_ns, *self.state)))
         self._transforms.send(pose)
         self._pose_out.publish(encode_pose(pose))
 
-    def _measured_pose(self) -> Pose:
+    def _measured_pose(self) -> StampedPose:
         """What the AGV makes known of its pose at step k."""
         plant, stamp_ns = self.settings, self.grid.stamp(self.k)
         if not plant.is_noisy:
-            return Pose(stamp_ns, *self.state)
+            return StampedPose(stamp_ns, *self.state)
         n_x, n_y, n_theta, _ = self._noise.at(self.k)
-        return Pose(stamp_ns, *measured(*self.state, n_x, n_y, n_theta, plant.noise_xy, plant.noise_theta))
+        return StampedPose(stamp_ns, *measured(*self.state, n_x, n_y, n_theta, plant.noise_xy, plant.noise_theta))
 
     def _advance(self, command: Command) -> None:
         """From step k to k + 1 under the newest command."""

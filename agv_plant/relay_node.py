@@ -16,17 +16,10 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.parameters import RelayParameters
 from agv_plant.radio.link import Channel, Link, Passage
-from agv_ros.codec import (
-    InvalidMessageError,
-    decode_command,
-    decode_odometry,
-    decode_pose,
-    encode_slot,
-    encode_twist,
-    stamp_of,
-)
+from agv_ros.codec import decode_command, decode_odometry, decode_pose, encode_slot, encode_twist, stamp_of
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST
+from agv_ros.messages import InvalidMessageError
 from agv_ros.node import LoopNode, Output
 
 _LOOK_PERIOD = 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agv_ros.codec import Command
+from agv_ros.messages import Command
 
 
 class ZeroOrderHold:

@@ -24,84 +24,24 @@ import math
 import struct
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import NamedTuple
 
+from agv_ros.messages import (
+    FRAME_AGV,
+    FRAME_MAP,
+    FRAME_REFERENCE,
+    SQUARED_LENGTH,
+    Command,
+    InvalidMessageError,
+    Slot,
+    StampedPose,
+    TrackingError,
+    quaternion_of_yaw,
+    yaw_of_quaternion,
+)
 from agv_ros.stamps import NS_PER_S
-
-FRAME_MAP = "map"
-FRAME_AGV = "base_link"
-FRAME_REFERENCE = "reference"
-
-DELIVERED = "delivered"
-LOST = "lost"
-DELAYED = "delayed"
-"""What a slot says of its message; a delayed one comes in a later slot."""
-
-PUBLISHED = "published "
-"""Key, before the topic's name, under which a node's diagnostics say how many messages it has published there."""
-
-SQUARED_LENGTH = 0.01
-"""How far the squared length of a rotation's quaternion may be from one."""
 
 _HEADER = 4
 _MAX_STRING = 4096
-
-
-class InvalidMessageError(ValueError):
-    """A message that must not enter the loop; the text says what is wrong with it."""
-
-
-class Pose(NamedTuple):
-    """geometry_msgs/PoseStamped: X_c at an instant; x, y [m], theta [rad] in frame `map`."""
-
-    stamp_ns: int
-    x: float
-    y: float
-    theta: float
-
-
-class Command(NamedTuple):
-    """geometry_msgs/TwistStamped: u at an instant; v [m/s], w [rad/s] in frame `base_link`."""
-
-    stamp_ns: int
-    v: float
-    w: float
-
-
-class TrackingError(NamedTuple):
-    """nav_msgs/Odometry: the reference seen from the AGV; x_e, y_e [m], theta_e [rad], v_r [m/s], w_r [rad/s]."""
-
-    stamp_ns: int
-    x_e: float
-    y_e: float
-    theta_e: float
-    v_r: float
-    w_r: float
-
-
-class Slot(NamedTuple):
-    """sensor_msgs/TimeReference: the channel's verdict on one slot and the freshest stamp held behind it (0: none)."""
-
-    stamp_ns: int
-    freshest_ns: int
-    verdict: str
-    note: str = ""
-    """More of the verdict, as in `cause=rayleigh run=3 gain=-23.81`: words `name=value` with a blank between them."""
-
-
-def facts_in(note: str) -> dict[str, str]:
-    """What a slot's note says, by name; words of another form are passed over."""
-    return dict(word.split("=", 1) for word in note.split() if "=" in word)
-
-
-def quaternion_of_yaw(theta: float) -> tuple[float, float]:
-    """Components (z, w) of the unit quaternion that turns by `theta` [rad] about +z."""
-    return math.sin(0.5 * theta), math.cos(0.5 * theta)
-
-
-def yaw_of_quaternion(x: float, y: float, z: float, w: float) -> float:
-    """Yaw [rad] in (-pi, pi] of a quaternion, which need not have length one exactly."""
-    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
 @lru_cache(maxsize=512)
@@ -179,7 +119,7 @@ def encode_clock(stamp_ns: int) -> bytes:
     return _LITTLE + struct.pack("<iI", *_split(stamp_ns))
 
 
-def encode_pose(pose: Pose) -> bytes:
+def encode_pose(pose: StampedPose) -> bytes:
     """geometry_msgs/PoseStamped in frame `map`; z, roll and pitch are zero."""
     frame = FRAME_MAP.encode() + b"\0"
     layout = _layout("<", "iI", (len(frame),), "7d", 8)
@@ -187,16 +127,16 @@ def encode_pose(pose: Pose) -> bytes:
     return _LITTLE + layout.pack(*_split(pose.stamp_ns), len(frame), frame, pose.x, pose.y, 0.0, 0.0, 0.0, z, w)
 
 
-def decode_pose(data: bytes) -> Pose:
+def decode_pose(data: bytes) -> StampedPose:
     """geometry_msgs/PoseStamped; theta in (-pi, pi]. Raises InvalidMessageError."""
     order = _order(data)
     layout = _layout(order, "iI", (_string_length(order, data, 8),), "7d", 8)
     sec, nanosec, _, _, x, y, _, qx, qy, qz, qw = _unpack(layout, data)
     _finite("pose", (x, y))
-    return Pose(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("pose", qx, qy, qz, qw))
+    return StampedPose(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("pose", qx, qy, qz, qw))
 
 
-def encode_transform(pose: Pose, child: str) -> bytes:
+def encode_transform(pose: StampedPose, child: str) -> bytes:
     """tf2_msgs/TFMessage with one transform: where frame `child` is in frame `map`."""
     frame, child_frame = FRAME_MAP.encode() + b"\0", child.encode() + b"\0"
     layout = _layout("<", "IiI", (len(frame), len(child_frame)), "7d", 8)
@@ -256,9 +196,9 @@ def decode_error(data: bytes) -> TrackingError:
     return TrackingError(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("tracking error", qx, qy, qz, qw), v, w)
 
 
-def decode_odometry(data: bytes) -> Pose:
+def decode_odometry(data: bytes) -> StampedPose:
     """nav_msgs/Odometry, the pose in it; theta in (-pi, pi]. Raises InvalidMessageError."""
-    return Pose(*decode_error(data)[:4])
+    return StampedPose(*decode_error(data)[:4])
 
 
 def encode_slot(slot: Slot) -> bytes:

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from agv_ros.codec import Slot
+from agv_ros.messages import Slot
 
 
 class Stamped(Protocol):

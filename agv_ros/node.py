@@ -28,8 +28,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
-from agv_ros.codec import PUBLISHED, InvalidMessageError, encode_diagnostics, stamp_of
+from agv_ros.codec import encode_diagnostics, stamp_of
 from agv_ros.errors import UserError
+from agv_ros.messages import PUBLISHED, InvalidMessageError
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid, to_nanoseconds
 

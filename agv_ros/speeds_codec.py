@@ -10,7 +10,8 @@ import struct
 from functools import lru_cache
 from typing import NamedTuple
 
-from agv_ros.codec import InvalidMessageError, stamp_of
+from agv_ros.codec import stamp_of
+from agv_ros.messages import InvalidMessageError
 from agv_ros.stamps import NS_PER_S
 
 _ENCAPSULATION = b"\x00\x01\x00\x00"

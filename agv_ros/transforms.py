@@ -8,7 +8,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from agv_ros.codec import Pose, encode_transform
+from agv_ros.codec import encode_transform
+from agv_ros.messages import StampedPose
 
 if TYPE_CHECKING:
     from agv_ros.node import LoopNode
@@ -33,7 +34,7 @@ class TransformBroadcaster:
         """Is tf2_msgs installed?"""
         return self._publisher is not None
 
-    def send(self, pose: Pose) -> None:
+    def send(self, pose: StampedPose) -> None:
         """The frame is there at the pose's stamp."""
         if self._publisher is not None and self._publisher.get_subscription_count():
             self._publisher.publish(encode_transform(pose, self._frame))

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.run import Floats
-from agv_ros.codec import yaw_of_quaternion
 from agv_ros.errors import UserError
+from agv_ros.messages import yaw_of_quaternion
 from agv_ros.stamps import NS_PER_S
 
 Steps = NDArray[np.int64]

@@ -19,8 +19,8 @@ from agv_analysis.run import Floats, LinkSlots, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.parameters import PATH
 from agv_cloud.reference.reference import Reference
-from agv_ros.codec import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_quaternion
 from agv_ros.errors import UserError
+from agv_ros.messages import DELAYED, DELIVERED, SQUARED_LENGTH, facts_in, yaw_of_quaternion
 from agv_ros.stamps import NS_PER_S, Grid
 
 Steps = NDArray[np.int64]

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_ros.codec import PUBLISHED
+from agv_ros.messages import PUBLISHED
 from agv_ros.stamps import NS_PER_S, Grid
 
 TOPIC = "/diagnostics"

@@ -24,8 +24,9 @@ from agv_analysis.bags.writer import BagWriter, TopicInfo
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version
-from agv_ros.codec import PUBLISHED, stamp_of
+from agv_ros.codec import stamp_of
 from agv_ros.executor import run_node
+from agv_ros.messages import PUBLISHED
 from agv_ros.node import ENDED, LoopNode
 
 TOPICS: dict[str, type] = {

@@ -26,10 +26,12 @@ from agv_analysis.simulation.loop import at_rest, edge_step, received
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.parameters import PATH
 from agv_cloud.reference.reference import Reference, ReferencePoint
-from agv_cloud.staleness import Posture, Prediction
+from agv_cloud.staleness import Prediction
 from agv_plant.vehicle.unicycle import STEPS
-from agv_ros.codec import Command, InvalidMessageError, TrackingError, decode_slot, stamp_of
+from agv_ros.codec import decode_slot, stamp_of
 from agv_ros.errors import UserError
+from agv_ros.messages import Command, InvalidMessageError, TrackingError
+from agv_ros.pose import Pose
 from agv_ros.stamps import Grid, OffGridError
 
 TOLERANCE = 1e-9
@@ -129,7 +131,7 @@ def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
     for i in map(int, np.flatnonzero(there)):
         row = int(held[i])
         k, taken = int(run.k[i]), int(run.k[row])
-        pose = Posture(*run.sent_pose[row].tolist())
+        pose = Pose(*run.sent_pose[row].tolist())
         if predicts:
             pose = prediction.at(k, taken, pose)
         at_edge = received(at_rest(*pose), *pose, *reference[row][:3], k - taken)

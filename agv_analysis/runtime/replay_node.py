@@ -16,7 +16,8 @@ from sensor_msgs.msg import TimeReference
 from agv_analysis.bags.writer import REPLAY_OF
 from agv_analysis.runtime.recorder_node import TOPICS, RecorderNode
 from agv_analysis.runtime.replay import EdgeInputs, Input
-from agv_ros.codec import Command, TrackingError, decode_command, decode_error, encode_clock
+from agv_ros.codec import decode_command, decode_error, encode_clock
+from agv_ros.messages import Command, TrackingError
 from agv_ros.node import LOOP_QOS, LoopNode
 from agv_ros.parameters import LoopParameters
 

@@ -27,9 +27,9 @@ from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
 from agv_plant.radio.link import check_length
 from agv_plant.relay_node import RelayNode
-from agv_ros.codec import Command, TrackingError
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals
+from agv_ros.messages import Command, TrackingError
 from agv_ros.node import LoopNode, overrides
 from agv_ros.parameters import LoopParameters
 

@@ -15,7 +15,8 @@ The predictor takes every command that was sent for one that was obeyed: the edg
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+
+from agv_ros.pose import Pose
 
 POLICIES = ("hold", "align", "predict")
 """By name, each at the place of its number."""
@@ -24,14 +25,6 @@ HOLD, ALIGN, PREDICT = range(3)
 
 Step = Callable[[float, float, float, float, float, float], tuple[float, float, float]]
 """One sampling period of the plant, as `agv_plant.vehicle.unicycle.euler_step`."""
-
-
-class Posture(NamedTuple):
-    """x [m], y [m], theta [rad] in frame `map`."""
-
-    x: float
-    y: float
-    theta: float
 
 
 class Prediction:
@@ -47,7 +40,7 @@ class Prediction:
         self._newest = (0.0, 0.0)
         self._from = -1
         self._k = 0
-        self._predicted = Posture(0.0, 0.0, 0.0)
+        self._predicted = Pose(0.0, 0.0, 0.0)
 
     def add_command(self, k: int, v: float, w: float) -> None:
         """The command that was sent at step k [m/s, rad/s]."""
@@ -57,7 +50,7 @@ class Prediction:
         """Is it known what was sent at step k, or does it not matter any more?"""
         return k in self._sent or k < self._k
 
-    def at(self, k: int, taken: int, pose: Posture) -> Posture:
+    def at(self, k: int, taken: int, pose: Pose) -> Pose:
         """The pose at step k, predicted from the one that was taken at step `taken` <= k.
 
         A step at which no command was sent is taken for one under the command before it.
@@ -67,6 +60,6 @@ class Prediction:
             self._sent = {step: command for step, command in self._sent.items() if step >= taken}
         for step in range(self._k, k):
             self._newest = self._sent.get(step, self._newest)
-            self._predicted = Posture(*self._step(*self._predicted, *self._newest, self._ts))
+            self._predicted = Pose(*self._step(*self._predicted, *self._newest, self._ts))
         self._k = k
         return self._predicted

@@ -22,7 +22,7 @@ from agv_plant.radio.delay import EXPIRED, delays_of, whole_slots
 from agv_plant.radio.schedule import OUTAGE, is_scripted
 from agv_plant.radio.shared_uplink import SCHEDULERS, serve, stream_of
 from agv_plant.random_stream import InBlocks, uniforms
-from agv_ros.codec import DELAYED, DELIVERED, LOST, Slot
+from agv_ros.messages import DELAYED, DELIVERED, LOST, Slot
 from agv_ros.parameters import LoopParameters
 from agv_ros.stamps import Grid, NearestSteps, Steps
 

@@ -8,15 +8,6 @@ Scalar functions of floats, SI units, frame `map`. The angle is never wrapped: i
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
-
-class State(NamedTuple):
-    """Posture X = (x, y, theta) [m, m, rad] in frame `map`."""
-
-    x: float
-    y: float
-    theta: float
 
 
 def euler_step(x: float, y: float, theta: float, v: float, w: float, ts: float) -> tuple[float, float, float]:

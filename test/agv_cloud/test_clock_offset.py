@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_cloud.clock_offset import BELIEVED_NS, IN_A_ROW, WINDOW_NS, FreshestPose
-from agv_ros.codec import Pose
+from agv_ros.messages import StampedPose
 
 MS = 1_000_000
 TS = 5 * MS
 HOUR = 3600 * 1000 * MS
 
 
-def pose(stamp_ns: int) -> Pose:
-    return Pose(stamp_ns, 0.0, 0.0, 0.0)
+def pose(stamp_ns: int) -> StampedPose:
+    return StampedPose(stamp_ns, 0.0, 0.0, 0.0)
 
 
 def test_before_the_first_pose_there_is_none() -> None:

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_plant.zero_order_hold import ZeroOrderHold
-from agv_ros.codec import Command
+from agv_ros.messages import Command
 
 TIMEOUT = 100
 

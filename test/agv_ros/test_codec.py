@@ -19,13 +19,6 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from agv_ros.codec import (
-    DELIVERED,
-    LOST,
-    Command,
-    InvalidMessageError,
-    Pose,
-    Slot,
-    TrackingError,
     decode_command,
     decode_error,
     decode_pose,
@@ -35,8 +28,17 @@ from agv_ros.codec import (
     encode_error,
     encode_pose,
     encode_slot,
-    quaternion_of_yaw,
     stamp_of,
+)
+from agv_ros.messages import (
+    DELIVERED,
+    LOST,
+    Command,
+    InvalidMessageError,
+    Slot,
+    StampedPose,
+    TrackingError,
+    quaternion_of_yaw,
     yaw_of_quaternion,
 )
 
@@ -49,7 +51,7 @@ Value = Any
 stamps = st.integers(1, 2**31 * NS - 1)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 angles = st.floats(-math.pi, math.pi)
-poses = st.builds(Pose, stamps, numbers, numbers, angles)
+poses = st.builds(StampedPose, stamps, numbers, numbers, angles)
 commands = st.builds(Command, stamps, numbers, numbers)
 errors = st.builds(TrackingError, stamps, numbers, numbers, angles, numbers, numbers)
 frames = st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=40)
@@ -63,20 +65,20 @@ slots = st.builds(
 values = st.one_of(poses, commands, errors, slots)
 
 ENCODE: dict[type, Callable[[Any], bytes]] = {
-    Pose: encode_pose, Command: encode_command, TrackingError: encode_error, Slot: encode_slot,
+    StampedPose: encode_pose, Command: encode_command, TrackingError: encode_error, Slot: encode_slot,
 }  # fmt: skip
 DECODE: dict[type, Callable[[bytes], Value]] = {
-    Pose: decode_pose, Command: decode_command, TrackingError: decode_error, Slot: decode_slot,
+    StampedPose: decode_pose, Command: decode_command, TrackingError: decode_error, Slot: decode_slot,
 }  # fmt: skip
 TYPES = {
-    Pose: "geometry_msgs/msg/PoseStamped",
+    StampedPose: "geometry_msgs/msg/PoseStamped",
     Command: "geometry_msgs/msg/TwistStamped",
     TrackingError: "nav_msgs/msg/Odometry",
     Slot: "sensor_msgs/msg/TimeReference",
 }
-PADDING = {Pose: (), Command: (26, 27), TrackingError: (26, 27, 42, 43)}
+PADDING = {StampedPose: (), Command: (26, 27), TrackingError: (26, 27, 42, 43)}
 """Bytes between members that carry nothing, by the alignment rules of CDR and the lengths of the frames."""
-FRAMES = {Pose: "map", Command: "base_link", TrackingError: "base_link"}
+FRAMES = {StampedPose: "map", Command: "base_link", TrackingError: "base_link"}
 
 
 def padding(value: Value) -> tuple[int, ...]:
@@ -96,7 +98,7 @@ def fields(value: Value, frame: str | None = None) -> dict[str, Any]:
     """What the message of a value says, by the definition of its type; `frame` in place of the frame it is in."""
     own = value.note if isinstance(value, Slot) else FRAMES[type(value)]
     header = {"stamp": time(value.stamp_ns), "frame_id": own if frame is None else frame}
-    if isinstance(value, Pose):
+    if isinstance(value, StampedPose):
         return {"header": header, "pose": pose(value.x, value.y, value.theta)}
     if isinstance(value, Command):
         return {"header": header, "twist": twist(value.v, value.w)}
@@ -297,7 +299,7 @@ def test_a_little_endian_slot_made_by_hand() -> None:
 
 
 def test_frames_are_those_of_the_interface() -> None:
-    assert b"\x04\0\0\0map\0" in encode_pose(Pose(1, 0.0, 0.0, 0.0))
+    assert b"\x04\0\0\0map\0" in encode_pose(StampedPose(1, 0.0, 0.0, 0.0))
     assert b"\x0a\0\0\0base_link\0" in encode_command(Command(1, 0.0, 0.0))
     error = encode_error(TrackingError(1, 0.0, 0.0, 0.0, 0.0, 0.0))
     assert b"base_link\0" in error
@@ -318,7 +320,7 @@ def test_there_and_back(value: Value) -> None:
 @settings(deadline=None, derandomize=True)
 @given(st.floats(-1e4, 1e4))
 def test_an_angle_of_many_turns_comes_back_as_the_same_direction(theta: float) -> None:
-    found = decode_pose(encode_pose(Pose(1, 0.0, 0.0, theta))).theta
+    found = decode_pose(encode_pose(StampedPose(1, 0.0, 0.0, theta))).theta
     assert -math.pi <= found <= math.pi
     assert math.remainder(found - theta, math.tau) == pytest.approx(0.0, abs=1e-11)
 
@@ -340,7 +342,8 @@ def test_a_yaw_is_a_turn_about_z(theta: float) -> None:
 # -- what must not enter the loop --------------------------------------------------------------------------------------
 
 GOOD: list[Value] = [
-    Pose(NS, 1.0, 2.0, 0.5), Command(NS, 1.0, 0.5), TrackingError(NS, 1.0, 2.0, 0.1, 1.0, 0.2), Slot(NS, NS, DELIVERED),
+    StampedPose(NS, 1.0, 2.0, 0.5), Command(NS, 1.0, 0.5), TrackingError(NS, 1.0, 2.0, 0.1, 1.0, 0.2),
+    Slot(NS, NS, DELIVERED),
 ]  # fmt: skip
 
 

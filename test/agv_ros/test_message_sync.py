@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_ros.codec import DELIVERED, LOST, Slot
 from agv_ros.message_sync import MOST_WAITING, Joined, MessageSync
+from agv_ros.messages import DELIVERED, LOST, Slot
 
 START, TS = 1_000_000_000, 5_000_000
 

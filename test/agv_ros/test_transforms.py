@@ -27,7 +27,8 @@ from agv_analysis.recordings.other_robots import RobotTopics, read_robot_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_cloud.reference.reference import Reference
-from agv_ros.codec import Pose, decode_odometry, decode_pose, encode_transform
+from agv_ros.codec import decode_odometry, decode_pose, encode_transform
+from agv_ros.messages import StampedPose
 from agv_ros.transforms import TOPIC
 
 REPOSITORY = Path(__file__).parents[2]
@@ -55,12 +56,12 @@ def place(transform: Any) -> tuple[float, float, float]:
 
 
 numbers = st.floats(-1e6, 1e6)
-poses = st.builds(Pose, st.integers(1, 2**31 * NS - 1), numbers, numbers, st.floats(-np.pi, np.pi))
+poses = st.builds(StampedPose, st.integers(1, 2**31 * NS - 1), numbers, numbers, st.floats(-np.pi, np.pi))
 frames = st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=40)
 
 
 @given(poses, frames)
-def test_another_library_reads_what_was_meant(pose: Pose, frame: str) -> None:
+def test_another_library_reads_what_was_meant(pose: StampedPose, frame: str) -> None:
     data = encode_transform(pose, frame)
     transform = decoded(data)
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", frame)
@@ -71,7 +72,7 @@ def test_another_library_reads_what_was_meant(pose: Pose, frame: str) -> None:
 
 
 @given(poses)
-def test_the_bytes_are_those_that_another_library_writes(pose: Pose) -> None:
+def test_the_bytes_are_those_that_another_library_writes(pose: StampedPose) -> None:
     data = encode_transform(pose, "agv1/base_link")
     message = STORE.deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
     again = STORE.serialize_cdr(message, "tf2_msgs/msg/TFMessage")
@@ -117,7 +118,7 @@ def test_whoever_listens_gets_both_frames(of_another_type: None, prefix: str) ->
     settings = (f"plant.frame_prefix={prefix}", "plant.duration=.inf")
     scenario = load_scenario(str(REPOSITORY / "config/outages.yaml"), settings)
     transforms: dict[str, dict[int, Any]] = {f"{prefix}base_link": {}, f"{prefix}reference": {}}
-    sent: dict[int, Pose] = {}
+    sent: dict[int, StampedPose] = {}
 
     def on_transform(data: bytes) -> None:
         transform = decoded(data)

@@ -17,8 +17,9 @@ from mcap.writer import Writer
 from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.scenario import load_scenario
-from agv_ros.codec import DELAYED, DELIVERED, LOST, decode_slot, encode_slot
+from agv_ros.codec import decode_slot, encode_slot
 from agv_ros.errors import UserError
+from agv_ros.messages import DELAYED, DELIVERED, LOST
 
 REPOSITORY = Path(__file__).parents[3]
 SAMPLE = REPOSITORY / "bags/sample"

@@ -34,9 +34,10 @@ from agv_analysis.runtime.replay import (
 from agv_analysis.scenario import SCHEMAS
 from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import load_trace
-from agv_ros.codec import DELIVERED, Pose, Slot, encode_clock, stamp_of
+from agv_ros.codec import encode_clock, stamp_of
 from agv_ros.errors import UserError
 from agv_ros.message_sync import MessageSync
+from agv_ros.messages import DELIVERED, Slot, StampedPose
 from agv_ros.stamps import Grid
 
 if TYPE_CHECKING:
@@ -319,15 +320,15 @@ def test_nodes_that_run_elsewhere_answer_too(agv_ncs: AgvNcs, start: Start, wait
 def test_a_slot_is_answered_however_often_it_is_sent(first: int) -> None:
     """In whatever order the two topics bring it, and though the next slot follows as soon as there is one answer."""
     grid = Grid(1_000_000_000, 5_000_000)
-    now, after = (Pose(grid.stamp(k), float(k), 0.0, 0.0) for k in (first, first + 1))
+    now, after = (StampedPose(grid.stamp(k), float(k), 0.0, 0.0) for k in (first, first + 1))
     poses, slots = [now, now, after], [Slot(pose.stamp_ns, pose.stamp_ns, DELIVERED) for pose in (now, now, after)]
     for places in itertools.combinations(range(6), 3):  # of the poses: each topic keeps its order
         pose, slot = iter(poses), iter(slots)
         sent = [next(pose) if i in places else next(slot) for i in range(6)]
         if min(sent.index(after), sent.index(slots[2])) < max(sent.index(now), sent.index(slots[0])):
             continue
-        join: MessageSync[Pose] = MessageSync(grid.start_ns)
-        answers: dict[int, Pose | None] = {}
+        join: MessageSync[StampedPose] = MessageSync(grid.start_ns)
+        answers: dict[int, StampedPose | None] = {}
         for message in (*sent, after, slots[2]):
             for found in join.add_slot(message) if isinstance(message, Slot) else join.add_message(message):
                 assert answers.setdefault(grid.step(found.slot.stamp_ns), found.message) == found.message

@@ -116,10 +116,10 @@ def test_a_change_in_any_file_or_constant_is_seen_in_spite_of_the_cache(tmp_path
 
 LOST = """
 import sys
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
 channel = ChannelParameters(model=sys.argv[1], p=0.5, r=0.5, n=2)
-print(*Air(3, 40).verdicts(channel, "uplink").astype(int), sep="")
+print(*ChannelRealisation(3, 40).verdicts(channel, "uplink").astype(int), sep="")
 """
 
 

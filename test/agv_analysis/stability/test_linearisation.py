@@ -22,23 +22,24 @@ from agv_analysis.stability.paper import matrices
 from agv_cloud.control.kanayama import control_law, limit_speed
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.vehicle.unicycle import State, euler_step
+from agv_plant.vehicle.unicycle import euler_step
+from agv_ros.pose import Pose
 
 TS = 0.005
 Floats = NDArray[np.float64]
 
 
-def off_by(reference: State, error: Floats) -> State:
+def off_by(reference: Pose, error: Floats) -> Pose:
     """The posture that sees the reference at `error` in its own frame: the tracking error turned round."""
     x_e, y_e, theta_e = error.tolist()
     theta = reference.theta - theta_e
     cos, sin = math.cos(theta), math.sin(theta)
-    return State(reference.x - cos * x_e + sin * y_e, reference.y - sin * x_e - cos * y_e, theta)
+    return Pose(reference.x - cos * x_e + sin * y_e, reference.y - sin * x_e - cos * y_e, theta)
 
 
 def next_error(now: Floats, outdated: Floats, v: float, w: float, by: ControllerParameters) -> Floats:
     """e(k+1) of the nonlinear loop for e(k) = now and a command from e(k-n) = outdated."""
-    reference = State(2.0, -1.0, 0.7)
+    reference = Pose(2.0, -1.0, 0.7)
     plant = off_by(reference, now)
     seen = tracking_error(*reference, *off_by(reference, outdated))
     command = control_law(*seen, v, w, by.kx, by.ky, by.ktheta)

@@ -17,7 +17,7 @@ from agv_cloud.control.plan import next_error
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import BUFFER, share_of_command
 from agv_plant.vehicle.unicycle import STEPS
-from agv_ros.codec import InvalidMessageError
+from agv_ros.messages import InvalidMessageError
 from agv_ros.parameters import ParameterError
 from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
 

@@ -20,12 +20,12 @@ ARGUMENTS = (0.5, 20.0, 200.0)
 CHANNEL = ("--set", "relay.uplink.model=roadworks", "--set", "relay.uplink.arguments=[0.5, 20.0, 200.0]")
 
 SAME = """
-from agv_analysis.simulation.channel_outcomes import Air
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import losses
 channel = ChannelParameters(model="roadworks", arguments=(0.5, 20.0, 200.0))
 found = losses(channel, 3, "uplink", 5000)
-assert (Air(3, 5000).verdicts(channel, "uplink") == found).all()
+assert (ChannelRealisation(3, 5000).verdicts(channel, "uplink") == found).all()
 print("".join(str(int(lost)) for lost in found))
 """
 

@@ -24,7 +24,7 @@ from agv_analysis.stability.verdict import ASYMPTOTIC, UNKNOWN, UNSTABLE
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.delay import EXPIRED, delay_in_slots, whole_slots
 from agv_plant.radio.link import Channel, Link, losses
-from agv_ros.codec import DELAYED, DELIVERED, LOST, facts_in
+from agv_ros.messages import DELAYED, DELIVERED, LOST, facts_in
 from agv_ros.stamps import Grid
 from test.agv_plant.radio.test_two_links import last_words
 

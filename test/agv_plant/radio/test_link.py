@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agv_plant.channels import MODELS
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.link import Channel, Link, losses
-from agv_ros.codec import DELIVERED, LOST
+from agv_ros.messages import DELIVERED, LOST
 from agv_ros.stamps import Grid, OffGridError
 
 GRID = Grid(1_000_000_000, 5_000_000)
