@@ -17,10 +17,11 @@ import hashlib
 import importlib.util
 import os
 import threading
-import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from agv_ros.substitution import Function, Replacements, calls_of, functions_in, named_by, plain, replaced, with_globals
 
 HAS_NUMBA = importlib.util.find_spec("numba") is not None
 """Is numba installed? Without it, everything runs as plain Python."""
@@ -29,27 +30,22 @@ _COMPILING = threading.Lock()
 """Held where numba's settings are changed for a moment."""
 
 
-@functools.cache
-def compiled(function: types.FunctionType) -> Callable[..., Any]:
-    """`function` with all functions that it calls, compiled; itself where numba is not installed.
+def compiled(function: Function, replacements: Replacements | None = None) -> Callable[..., Any]:
+    """`function` with all functions that it calls, compiled; as plain Python where numba is not installed.
 
     It is compiled at its first call, and releases the interpreter's lock while it runs. Arrays go in as they are; see
-    `numbers` for what runs without numba.
+    `numbers` for what runs without numba. A function that `replacements` names is called in place of the other.
     """
-    if not HAS_NUMBA:
-        return function
-    with _COMPILING:
-        return _compile(function, _cache_folder(function))
+    return _compiled(function, tuple((replacements or {}).items()))
 
 
 @functools.cache
-def compiled_with(function: types.FunctionType, **called: types.FunctionType) -> Callable[..., Any]:
-    """`function` compiled with functions of one's choice in place of its globals of these names.
-
-    Not enclosed by it, since what is compiled of a closure cannot be kept.
-    """
-    known = {**function.__globals__, **called}
-    return compiled(types.FunctionType(function.__code__, known, function.__name__))
+def _compiled(function: Function, replacements: tuple[tuple[Function, Function], ...]) -> Callable[..., Any]:
+    called = dict(replacements)
+    if not HAS_NUMBA:
+        return replaced(function, called)
+    with _COMPILING:
+        return _compile(function, _cache_folder(function, called), called)
 
 
 def numbers(array: Any) -> Any:
@@ -60,18 +56,16 @@ def numbers(array: Any) -> Any:
     return array if HAS_NUMBA else array.tolist()
 
 
-def _compile(function: types.FunctionType, folder: Path | None, inside: bool = False) -> Callable[..., Any]:
+def _compile(
+    function: Function, folder: Path | None, replacements: Replacements, inside: bool = False
+) -> Callable[..., Any]:
     """`function` compiled, to be kept in `folder` if there is one, or to be put `inside` each of its callers."""
     import numba
 
-    inner = {name: _compile(called, None, inside=True) for name, called in _called(function)}
-    copy = types.FunctionType(
-        function.__code__,
-        {**function.__globals__, **inner},
-        function.__name__,
-        function.__defaults__,
-        tuple(types.CellType(inner.get(name, value)) for name, value in _enclosed(function)) or None,
-    )
+    inner = {
+        name: _compile(called, None, replacements, inside=True) for name, called in calls_of(function, replacements)
+    }
+    copy = with_globals(function, inner)
     usual = numba.config.CACHE_DIR
     try:
         numba.config.CACHE_DIR = str(folder or "")  # looked at by the decorator, not later
@@ -81,32 +75,15 @@ def _compile(function: types.FunctionType, folder: Path | None, inside: bool = F
     return dispatcher
 
 
-def _enclosed(function: types.FunctionType) -> list[tuple[str, Any]]:
-    cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    return list(zip(function.__code__.co_freevars, cells, strict=True))
-
-
-def _named(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
-    """Everything outside of itself that a function names."""
-    for name in function.__code__.co_names:
-        if name in function.__globals__:
-            yield name, function.__globals__[name]
-    yield from _enclosed(function)
-
-
-def _called(function: types.FunctionType) -> list[tuple[str, types.FunctionType]]:
-    return [(name, value) for name, value in _named(function) if isinstance(value, types.FunctionType)]
-
-
-def _cache_folder(function: types.FunctionType) -> Path | None:
+def _cache_folder(function: Function, replacements: Replacements) -> Path | None:
     """Folder for the compiled function, made if need be; None if it cannot be, or for a closure.
 
     A closure is known to numba's cache by what it encloses, which is another object in every process.
     """
-    if function.__closure__:
+    if plain(function).__closure__:
         return None
     try:
-        folder = _cache_base() / _digest(function)
+        folder = _cache_base() / _digest(function, replacements)
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # Path.home() may not exist
         return None
@@ -118,20 +95,13 @@ def _cache_base() -> Path:
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "agv_ncs"
 
 
-def _digest(function: types.FunctionType) -> str:
+def _digest(function: Function, replacements: Replacements) -> str:
     """Name of the code that goes into a compiled function: all sources, and the constants taken from other files."""
     digest = hashlib.sha256()
-    for part in _functions(function):
-        digest.update(Path(part.__code__.co_filename).read_bytes())
-        digest.update(part.__code__.co_code)  # which tells apart functions of one file
-        constants = {name: value for name, value in _named(part) if isinstance(value, (bool, int, float, str))}
+    for part in functions_in(function, replacements):
+        source = Path(plain(part).__code__.co_filename)
+        digest.update(source.read_bytes() if source.is_file() else (part.__doc__ or "").encode())
+        digest.update(plain(part).__code__.co_code)  # which tells apart functions of one file
+        constants = {name: value for name, value in named_by(part) if isinstance(value, (bool, int, float, str))}
         digest.update(repr(sorted(constants.items())).encode())
     return digest.hexdigest()[:16]
-
-
-def _functions(function: types.FunctionType) -> list[types.FunctionType]:
-    """A function and all that it calls, each once, in the order of the calls."""
-    found = {function: None}
-    for _, called in _called(function):
-        found.update(dict.fromkeys(_functions(called)))
-    return list(found)

@@ -20,11 +20,12 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from agv_cloud.clock_offset import FreshestPose
 from agv_cloud.parameters import PATH, ErrorDetectorParameters
 from agv_cloud.reference.path_track import Curve, PathError, PathReference, PathTrack, Point
-from agv_cloud.reference.reference import Reference, ReferencePoint
+from agv_cloud.reference.point import ReferencePoint
+from agv_cloud.reference.reference import Reference
 from agv_cloud.reference.thinned_path import path_points, thinned
-from agv_cloud.staleness import Prediction
+from agv_cloud.staleness.estimate import PoseEstimator
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.codec import (
     decode_command,
     decode_odometry,
@@ -72,8 +73,8 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._join: MessageSync[StampedPose] = MessageSync(self.grid.start_ns)
         self._steps = Steps(self.grid)
         self._blind = 0
-        self._predicts = self.settings.policy == "predict"
-        self._prediction = self._new_prediction()
+        self._ahead = self.settings.steps_ahead
+        self._estimator = self._new_estimator()
         self._ready: deque[Joined[StampedPose]] = deque()
         self._answered = -1
         self._error_out = self.output(Odometry, "edge/error")
@@ -107,7 +108,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             self._show(path_points(self.reference, self.settings))
         else:
             self._listen_for_paths()
-        if self._predicts:
+        if self._estimator.uses_commands:
             self.input(TwistStamped, "edge/cmd_vel", self._on_command)
 
     def _show(self, points: Iterable[ReferencePoint]) -> None:
@@ -122,12 +123,16 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             path.poses.append(pose)
         self._path_out.publish(path)
 
-    def _new_prediction(self) -> Prediction:
-        return Prediction(STEPS[self.settings.integration], self.settings.ts)
+    def _new_estimator(self) -> PoseEstimator:
+        settings, name = self.settings, self.settings.policy
+        number = STALENESS_POLICIES.names().index(name)
+        return PoseEstimator(
+            STALENESS_POLICIES.find(name), number, settings.policy_values, settings.ts, settings.integration == "arc"
+        )
 
     def _forget_the_run_before(self) -> None:
         """A run begins: what was sent in one before it is past."""
-        self._prediction = self._new_prediction()
+        self._estimator = self._new_estimator()
         if isinstance(self.reference, PathReference):
             self.reference.restart()
 
@@ -186,8 +191,8 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._show(thinned(track, track.steps))
 
     def _reference_at(self, k: int, held: Pose) -> ReferencePoint:
-        """The reference at step k; before the first path, that the AGV stands where it is held to be."""
-        found = self.reference[k]
+        """What step k is compared with; before the first path, that the AGV stands where it is held to be."""
+        found = self.reference[k + self._ahead]
         return ReferencePoint(*held, 0.0, 0.0) if found is None else found
 
     # -- by slots ----------------------------------------------------------------------------------------------------
@@ -208,7 +213,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
 
     def _on_command(self, data: bytes) -> None:
         command = decode_command(data)
-        self._prediction.add_command(self._steps.of(command.stamp_ns), command.v, command.w)
+        self._estimator.add_command(self._steps.of(command.stamp_ns), command.v, command.w)
         self._answer([])
 
     def _answer(self, ready: list[Joined[StampedPose]]) -> None:
@@ -218,10 +223,10 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
 
     def _may_answer(self) -> bool:
         """A prediction waits for the command that answers the step before, unless the next step comes first."""
-        if not self._predicts or len(self._ready) > 1:
+        if not self._estimator.uses_commands or len(self._ready) > 1:
             return True
         k = self.grid.step(self._ready[0].slot.stamp_ns)
-        return k - 1 != self._answered or self._prediction.has_command(k - 1)
+        return k - 1 != self._answered or self._estimator.has_command(k - 1)
 
     def _answer_one(self, joined: Joined[StampedPose]) -> None:
         stamp_ns, pose = joined.slot.stamp_ns, joined.message
@@ -287,19 +292,23 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
 
     def _compare(self, k: int, taken: int, pose: StampedPose) -> None:
         """Publish the error of step k, as a pose tells it that was taken at step `taken`."""
-        stamp_ns, held = self.grid.stamp(k), Pose(pose.x, pose.y, pose.theta)
-        if self._predicts:
-            held = self._prediction.at(k, taken, held)
+        stamp_ns, received = self.grid.stamp(k), Pose(pose.x, pose.y, pose.theta)
         if isinstance(self.reference, PathReference):
             self.reference.begin(k)
+        try:
+            held, target = self._estimator.at(k, taken, received, lambda step: self._reference_at(step, received))
+        except Exception as problem:  # another package's policy, in which anything can go wrong
+            where = STALENESS_POLICIES.where(self.settings.policy)
+            self.fail(f"{where} raises {type(problem).__name__}: {problem}, at step {k}")
+            return
         now = self._reference_at(k, held)
-        target = self._reference_at(taken, held) if self.settings.policy == "align" else now
-        eps = tracking_error(target.x, target.y, target.theta, *held)
+        eps = tracking_error(*target, *held)
         self._answered = k
         error = TrackingError(stamp_ns, *eps, now.v, now.w)
         if self._horizon_out is not None:
             self._horizon_out.publish(self._horizon(k, held))
-        posture = StampedPose(stamp_ns, now.x, now.y, now.theta)
+        here = now if self._ahead == 0 else self.reference[k] or now
+        posture = StampedPose(stamp_ns, here.x, here.y, here.theta)
         if self._reference_out is not None:
             self._reference_out.publish(encode_pose(posture))
         self._transforms.send(posture)

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Any
 
+from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.reference.tracks import TRACKS
-from agv_cloud.staleness import POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES
-from agv_ros.parameters import LoopParameters, ParameterError, parameter
+from agv_ros.parameters import LoopParameters, ParameterError, merged, parameter
+from agv_ros.parts import Part, PartError, checked, field_of, schema_of
 
 TRIGGERS = ("slot", "timer")
 
 CSV, PATH = "csv", "path"
 """Tracks that come from elsewhere: a file, or a topic."""
+
+
+_PolicyParameters = schema_of("PolicyParameters", STALENESS_POLICIES.usable(), globals())
+_LawParameters = schema_of(
+    "LawParameters", {name: law for name, law in CONTROL_LAWS.usable().items() if name != KANAYAMA}, globals()
+)
+_KANAYAMA = CONTROL_LAWS.find(KANAYAMA)
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,7 @@ class ErrorDetectorParameters(LoopParameters):
         "hold",
         "what an outdated pose is compared with; hold: the reference of now, align: that of its instant, predict: it "
         "is moved on by the plant's model under the commands sent since, and compared with the reference of now",
-        choices=POLICIES,
+        choices=STALENESS_POLICIES.names(),
     )
     integration: str = parameter(
         "euler", "predict: how the plant's model integrates one period, as plant.integration", choices=tuple(STEPS)
@@ -65,8 +76,12 @@ class ErrorDetectorParameters(LoopParameters):
         "pose", "type of edge/pose; pose: geometry_msgs/PoseStamped, odometry: nav_msgs/Odometry", choices=POSE_TYPES
     )
 
+    of_policies: Any = merged(_PolicyParameters)
+    """Parameters of policies that have some, `policy.parameter`."""
+
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
+        STALENESS_POLICIES.find(self.policy)
         if self.track == CSV and not self.track_file:
             raise ParameterError("error_detector.track is csv, but error_detector.track_file is empty: name a file")
         if self.lap_time < 16.0 * self.ts:
@@ -74,14 +89,29 @@ class ErrorDetectorParameters(LoopParameters):
                 f"error_detector.lap_time must be at least 16 ts = {16.0 * self.ts:g} s, got {self.lap_time!r}"
             )
 
+    @property
+    def policy_values(self) -> tuple[float, ...]:
+        """The parameters of the chosen policy, in the order of its signature."""
+        own = getattr(self.of_policies, self.policy, None)
+        return () if own is None else dataclasses.astuple(own)
+
 
 @dataclass(frozen=True)
 class ControllerParameters(LoopParameters):
     """Parameters of the node `controller`."""
 
-    kx: float = parameter(25.0, "gain K_x of the error along the track", unit="1/s", low=0.0, high=1e6, runtime=True)
-    ky: float = parameter(1.0, "gain K_y of the error across the track", unit="1/m^2", low=0.0, high=1e6, runtime=True)
-    ktheta: float = parameter(2.0, "gain K_theta of the error of heading", unit="1/m", low=0.0, high=1e6, runtime=True)
+    law: str = parameter(
+        KANAYAMA,
+        "control law; kanayama: the paper's, with the gains kx, ky, ktheta, state_feedback: linear in the tracking "
+        "error, pure_pursuit: along the circle to the point that the reference reaches look_ahead later; the gains of "
+        "others than kanayama have the law's name before them",
+        choices=CONTROL_LAWS.names(),
+    )
+    kx: float = field_of(_KANAYAMA, "kx")
+    ky: float = field_of(_KANAYAMA, "ky")
+    ktheta: float = field_of(_KANAYAMA, "ktheta")
+    of_laws: Any = merged(_LawParameters)
+    """Gains of the other laws, `law.gain`."""
     integration: str = parameter(
         "euler", "how the model behind a plan integrates one period, as plant.integration", choices=tuple(STEPS)
     )
@@ -92,3 +122,37 @@ class ControllerParameters(LoopParameters):
         choices=COMMAND_TYPES,
     )
     v_max: float = parameter(math.inf, "limit on |v|, .inf: none", unit="m/s", above=0.0, high=math.inf, runtime=True)
+
+    def __post_init__(self) -> None:
+        """Check what no single bound can say: can the law be called?"""
+        law = CONTROL_LAWS.find(self.law)
+        if "look_ahead" in law.arguments and self.steps_ahead == 0:
+            raise ParameterError(
+                f"{CONTROL_LAWS.where(self.law)} looks ahead, but look_ahead is {self.look_ahead:g}: set it to one "
+                "period ts at least, the same on all nodes"
+            )
+        _try(law, self)
+
+    @property
+    def gains(self) -> tuple[float, ...]:
+        """The parameters of the chosen law, in the order of its signature."""
+        if self.law == KANAYAMA:
+            return self.kx, self.ky, self.ktheta
+        own = getattr(self.of_laws, self.law, None)
+        return () if own is None else dataclasses.astuple(own)
+
+
+_TRIALS = ((0.0, 0.0, 0.0, 1.0, 0.0), (0.1, -0.2, 0.3, 0.5, 0.1))
+"""Errors [m, m, rad] and speeds of the reference [m/s, rad/s] with which a law must be able to deal."""
+
+
+def _try(law: Part, settings: ControllerParameters) -> None:
+    """Call a law once or twice. Raises PartError if it raises or if its command is no two finite numbers."""
+    where = CONTROL_LAWS.where(law.name)
+    for trial in _TRIALS:
+        arguments = (*trial, law.memory, settings.gains, settings.ts, settings.look_ahead)
+        found = checked(law, where, lambda: law.adapter(*arguments))  # noqa: B023  # called at once
+        if len(found) != 2 + len(law.memory):
+            raise PartError(f"{where} must return as many numbers for its memory as it begins with: {len(law.memory)}")
+        if not all(map(math.isfinite, found)):
+            raise PartError(f"{where} returns {found} for the error and reference speeds {trial}: must be finite")

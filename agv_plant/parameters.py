@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from agv_plant.channels.coverage_hole import NO_HOLES
 from agv_plant.channels.coverage_hole import rows_of as holes
@@ -14,9 +16,13 @@ from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.radio.schedule import Entry, parse_schedule
 from agv_plant.radio.shared_uplink import SCHEDULERS
+from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES, TWIST
-from agv_ros.parameters import LoopParameters, ParameterError, TwoDomains, group, parameter, parameters_of
+from agv_ros.parameters import LoopParameters, ParameterError, TwoDomains, group, merged, parameter, parameters_of
+from agv_ros.parts import Part, PartError, checked, schema_of
+
+_VehicleParameters = schema_of("ParametersOfVehicles", VEHICLES.usable(), globals())
 
 
 @dataclass(frozen=True)
@@ -26,6 +32,14 @@ class PlantParameters(LoopParameters):
     initial_pose: tuple[float, float, float] = parameter(
         (0.0, 5.0, 1.5707963267948966), "X_c(0) = [x, y, theta] in frame map", unit="m, m, rad"
     )
+    vehicle: str = parameter(
+        UNICYCLE,
+        "vehicle; unicycle: turns as it is told, the paper's, bicycle: steers its front wheel; what vehicles have of "
+        "their own has their name before it",
+        choices=VEHICLES.names(),
+    )
+    of_vehicles: Any = merged(_VehicleParameters)
+    """Parameters of vehicles that have some, `vehicle.parameter`."""
     integration: str = parameter("euler", "how the plant integrates one period", choices=tuple(STEPS))
     clock: str = parameter(
         "lockstep",
@@ -86,8 +100,15 @@ class PlantParameters(LoopParameters):
 
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
+        _try(VEHICLES.find(self.vehicle), self)
         if self.downlink_policy == "buffer" and self.plan_steps == 0:
             raise ParameterError("plant.downlink_policy is buffer, but plan_steps is 0: set it, the same on all nodes")
+
+    @property
+    def vehicle_values(self) -> tuple[float, ...]:
+        """The parameters of the chosen vehicle, in the order of its signature."""
+        own = getattr(self.of_vehicles, self.vehicle, None)
+        return () if own is None else dataclasses.astuple(own)
 
     @property
     def policy_steps(self) -> float:
@@ -98,6 +119,15 @@ class PlantParameters(LoopParameters):
     def is_noisy(self) -> bool:
         """Does the AGV measure another pose than its true one?"""
         return self.noise_xy > 0.0 or self.noise_theta > 0.0
+
+
+def _try(vehicle: Part, plant: PlantParameters) -> None:
+    """Drive a vehicle for one step. Raises PartError if it raises or if its state is not finite."""
+    where, states = VEHICLES.where(vehicle.name), (0.0,) * len(vehicle.states)
+    arguments = (0.0, 0.0, 0.5, states, 1.0, 0.1, 1.0, 0.1, plant.ts, plant.integration == "arc", plant.vehicle_values)
+    found = checked(vehicle, where, lambda: vehicle.adapter(*arguments))
+    if not all(map(math.isfinite, found)):
+        raise PartError(f"{where} returns {found} for a step at 1 m/s and 0.1 rad/s: must be finite")
 
 
 @dataclass(frozen=True)

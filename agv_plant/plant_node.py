@@ -22,7 +22,8 @@ from agv_plant.deadline_monitor import DeadlineMonitor
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.parameters import PlantParameters
 from agv_plant.random_stream import normals_of
-from agv_plant.vehicle.motion import NOISE, SLIP, Motion, body_of, measured, move
+from agv_plant.vehicle.motion import NOISE, SLIP, Motion, measured, move, vehicle_parameters, vehicle_step
+from agv_plant.vehicle.registry import VEHICLES
 from agv_plant.zero_order_hold import ZeroOrderHold
 from agv_ros.codec import decode_command, decode_slot, encode_clock, encode_pose, stamp_of
 from agv_ros.executor import run_node
@@ -32,6 +33,7 @@ from agv_ros.node import LoopNode
 from agv_ros.pose import Pose
 from agv_ros.speeds_codec import decode_speeds
 from agv_ros.stamps import to_nanoseconds
+from agv_ros.substitution import replaced
 from agv_ros.transforms import TransformBroadcaster
 
 D = TypeVar("D")
@@ -67,8 +69,10 @@ class PlantNode(LoopNode[PlantParameters]):
         self.k = 0
         self.steps = math.inf if math.isinf(settings.duration) else max(1, round(settings.duration / settings.ts))
         self._steps_per_line = max(1, round(self.steps / 20 if math.isfinite(self.steps) else 10.0 / settings.ts))
-        self._motion = Motion(*settings.initial_pose)
-        self._body = body_of(settings)
+        vehicle = VEHICLES.find(settings.vehicle)
+        self._motion = Motion(*settings.initial_pose, states=(0.0,) * len(vehicle.states))
+        self._vehicle = vehicle_parameters(settings)
+        self._move = replaced(move, {vehicle_step: vehicle.adapter})
         self._noise = normals_of(settings.seed, NOISE)
         self._slip = normals_of(settings.seed, SLIP)
         self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
@@ -136,7 +140,12 @@ class PlantNode(LoopNode[PlantParameters]):
             v, w = plan[min(age, len(plan) - 1)]
         share = share_of_command(age, self._downlink_policy, plant.policy_steps)
         n_left, n_right = self._slip.at(self.k)[:2] if plant.slip_noise > 0.0 else (0.0, 0.0)
-        motion = move(self._motion, share * v, share * w, n_left, n_right, self._body)
+        try:
+            motion = self._move(self._motion, share * v, share * w, n_left, n_right, self._vehicle)
+        except Exception as problem:  # another package's vehicle, in which anything can go wrong
+            where = VEHICLES.where(plant.vehicle)
+            self.fail(f"{where} raises {type(problem).__name__}: {problem}, at step {self.k}")
+            return
         if not all(map(math.isfinite, motion[:3])):
             self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")
             return

@@ -134,6 +134,16 @@ def group(schema: type[T]) -> T:
     return dataclasses.field(default_factory=schema, metadata={"group": schema})
 
 
+def merged(schema: type) -> Any:
+    """As `group`, but the names of the nested dataclass stay as they are."""
+    return dataclasses.field(default_factory=schema, metadata={"group": schema, "prefix": ""})
+
+
+def _prefix(field: dataclasses.Field[Any]) -> str:
+    """What stands before the names of a group's parameters."""
+    return str(field.metadata.get("prefix", f"{field.name}."))
+
+
 _KINDS = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double_array"}
 
 
@@ -148,7 +158,8 @@ def _parameters_of(schema: type) -> Mapping[str, Parameter]:
     for field in dataclasses.fields(schema):
         if "group" in field.metadata:
             for name, inner in parameters_of(field.metadata["group"]).items():
-                found[f"{field.name}.{name}"] = dataclasses.replace(inner, name=f"{field.name}.{name}")
+                full = _prefix(field) + name
+                found[full] = dataclasses.replace(inner, name=full)
             continue
         known = dict(field.metadata["parameter"])
         free = known.pop("any_length")
@@ -187,7 +198,7 @@ def _assemble(schema: type[T], values: Mapping[str, Any]) -> T:
     arguments: dict[str, Any] = {}
     for field in dataclasses.fields(schema):  # type: ignore[arg-type]
         if "group" in field.metadata:
-            prefix = field.name + "."
+            prefix = _prefix(field)
             inner = {name[len(prefix) :]: value for name, value in values.items() if name.startswith(prefix)}
             arguments[field.name] = _assemble(field.metadata["group"], inner)
         elif field.name in values:
@@ -201,7 +212,7 @@ def as_dict(instance: object) -> dict[str, Any]:
     for field in dataclasses.fields(instance):  # type: ignore[arg-type]
         value = getattr(instance, field.name)
         if "group" in field.metadata:
-            found.update({f"{field.name}.{name}": inner for name, inner in as_dict(value).items()})
+            found.update({_prefix(field) + name: inner for name, inner in as_dict(value).items()})
         else:
             found[field.name] = value
     return found
@@ -237,14 +248,27 @@ class LoopParameters:
         low=0,
         high=1000,
     )
+    look_ahead: float = parameter(
+        0.0,
+        "how far ahead in time the reference is that edge/error tells of, rounded to whole periods, the same on all "
+        "nodes; 0: that of now; for a control law that looks ahead",
+        unit="s",
+        low=0.0,
+        high=60.0,
+    )
     frame_prefix: str = parameter(
         "",
         "what the frames base_link and reference begin with, in messages and on /tf, as robot_state_publisher has it: "
         "agv1/ for one AGV of several; the frame map is everyone's",
     )
 
+    @property
+    def steps_ahead(self) -> int:
+        """Whole periods that edge/error looks ahead."""
+        return round(self.look_ahead / self.ts)
 
-SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_steps", "frame_prefix")
+
+SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_steps", "look_ahead", "frame_prefix")
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 from agv_analysis.scenario import Scenario
 from agv_cloud.reference.tracks import TRACKS
-from agv_cloud.staleness import POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.channels import MODELS
 from agv_plant.parameters import PlantParameters, RelayParameters
 from agv_ros.parameters import LoopParameters, as_dict
@@ -45,7 +45,11 @@ SLIDERS = (
     Slider("seed", "seed of the outages", 1.0, 100.0, 1.0),
 )
 
-CHOICES = {"model": ("channel", tuple(MODELS)), "policy": ("policy", POLICIES), "track": ("track", tuple(TRACKS))}
+CHOICES = {
+    "model": ("channel", tuple(MODELS)),
+    "policy": ("policy", STALENESS_POLICIES.names()),
+    "track": ("track", tuple(TRACKS)),
+}
 """Drop-down lists by key: label and what there is to choose from."""
 
 Values = Mapping[str, Any]

@@ -10,7 +10,7 @@ from agv_analysis.reproduce.claim import Values
 from agv_analysis.reproduce.claims import ON_TRACK
 from agv_analysis.reproduce.runs import gain, scenario
 from agv_analysis.simulation import simulate_batch
-from agv_cloud.staleness import POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 
 SEEDS = range(1, 21)
@@ -41,7 +41,7 @@ def edge() -> Iterator[Values]:
     for name, outages in OUTAGES.items():
         for scale in SCALES:
             kept = (ON_TRACK, *(f"relay.uplink.{setting}" for setting in outages), f"plant.speed_scale={scale}")
-            ranked = _ranked("error_detector.policy", POLICIES, kept)
+            ranked = _ranked("error_detector.policy", STALENESS_POLICIES.names(), kept)
             yield from ({"uplink": name, "speed scale": scale, **row} for row in ranked)
 
 

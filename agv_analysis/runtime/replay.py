@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,17 +22,21 @@ from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.recordings.recording import TOPICS, loop_topics
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.loop import at_rest, edge_step, received
+from agv_analysis.simulation.loop import EdgeState, edge_step
+from agv_analysis.simulation.parts import replacements_of
 from agv_analysis.simulation.single import settings_of
+from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.parameters import PATH
-from agv_cloud.reference.reference import Reference, ReferencePoint
-from agv_cloud.staleness import Prediction
-from agv_plant.vehicle.unicycle import STEPS
+from agv_cloud.reference.point import ReferencePoint
+from agv_cloud.reference.reference import Reference
+from agv_cloud.staleness.estimate import PoseEstimator
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_ros.codec import decode_slot, stamp_of
 from agv_ros.errors import UserError
 from agv_ros.messages import Command, InvalidMessageError, TrackingError
 from agv_ros.pose import Pose
 from agv_ros.stamps import Grid, OffGridError
+from agv_ros.substitution import replaced
 
 TOLERANCE = 1e-9
 """Largest difference that is none, as a share of the recorded value where that is above 1."""
@@ -113,12 +117,18 @@ def _held(run: Run) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     return held, run.k[held] == run.k - run.n_ul
 
 
-def _reference(run: Run, scenario: Scenario) -> list[ReferencePoint]:
-    """The reference of each row of a run: that of the scenario's track, or, along paths, the recorded one."""
+def _reference(run: Run, scenario: Scenario) -> Callable[[int], ReferencePoint]:
+    """What the edge compares with at each step: the scenario's track, or, along paths, the recorded reference.
+
+    Of a path that is not recorded as far ahead as the edge looked the last point that is.
+    """
+    ahead = scenario.error_detector.steps_ahead
     if scenario.error_detector.track == PATH:
-        return [ReferencePoint(*row) for row in run.reference.tolist()]
+        recorded = [ReferencePoint(*row) for row in run.reference.tolist()]
+        rows = {int(k): i for i, k in enumerate(run.k)}
+        return lambda k: recorded[rows.get(k + ahead, rows.get(k, -1) if ahead == 0 else -1)]
     reference = Reference(scenario.error_detector)
-    return [reference[k] for k in run.k.tolist()]
+    return lambda k: reference[k + ahead]
 
 
 def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
@@ -126,18 +136,17 @@ def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
     settings, reference = settings_of(scenario), _reference(run, scenario)
     held, there = _held(run)
     rows = np.full((len(run), 5), np.nan)
-    predicts = scenario.error_detector.policy == "predict"
-    prediction = Prediction(STEPS[scenario.error_detector.integration], run.ts)
+    edge, policy = scenario.error_detector, STALENESS_POLICIES.find(scenario.error_detector.policy)
+    estimator = PoseEstimator(policy, settings.policy, edge.policy_values, run.ts, settings.model_arc)
+    answer, memory = replaced(edge_step, replacements_of(scenario)), CONTROL_LAWS.find(scenario.controller.law).memory
     for i in map(int, np.flatnonzero(there)):
         row = int(held[i])
         k, taken = int(run.k[i]), int(run.k[row])
-        pose = Pose(*run.sent_pose[row].tolist())
-        if predicts:
-            pose = prediction.at(k, taken, pose)
-        at_edge = received(at_rest(*pose), *pose, *reference[row][:3], k - taken)
-        rows[i] = edge_step(at_edge, *reference[i], settings)
-        if predicts and np.isfinite(run.command[i]).all():
-            prediction.add_command(k, *run.command[i].tolist())
+        estimate = estimator.at(k, taken, Pose(*run.sent_pose[row].tolist()), reference)
+        at_edge = EdgeState(*estimate, k - taken, 0.0, 0.0, memory)
+        rows[i], memory = answer(at_edge, reference(k), settings)
+        if estimator.uses_commands and np.isfinite(run.command[i]).all():
+            estimator.add_command(k, *run.command[i].tolist())
     return rows[:, :3], rows[:, 3:]
 
 

@@ -13,7 +13,7 @@ from typing import get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled import numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
@@ -21,15 +21,16 @@ from agv_analysis.simulation.link_loop import LinkTrace, contraction_over_links,
 from agv_analysis.simulation.loop import (
     RunInputs,
     Statistics,
-    at_rest,
     statistics,
     statistics_of_twins,
     statistics_of_two,
 )
+from agv_analysis.simulation.parts import replacements_of
 from agv_analysis.simulation.reference import reference_of
-from agv_analysis.simulation.single import settings_of, steps_of
+from agv_analysis.simulation.single import run_parts, settings_of, start_of, steps_of
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
+from agv_ros.substitution import Replacements
 
 STATISTICS = np.dtype([
     *((name, np.dtype(kind)) for name, kind in get_type_hints(Statistics).items()), ("contraction", np.dtype(float))
@@ -93,9 +94,12 @@ class _Batch:
         self.table: Table = np.zeros((len(scenarios), len(seeds)), dtype=STATISTICS)
         self._scenarios, self._seeds, self._twins = scenarios, seeds, twins
         self._steps = [steps_of(scenario) for scenario in scenarios]
-        tracks: dict[tuple[ErrorDetectorParameters, int], int] = {}
-        kinds = [(scenario.error_detector, steps) for scenario, steps in zip(scenarios, self._steps, strict=True)]
-        self._track = [tracks.setdefault(kind, len(tracks)) for kind in kinds]
+        # Runs of one kind share a reference and a compiled loop.
+        kinds: dict[tuple[ErrorDetectorParameters, int, str, str], int] = {}
+        self._kind = [
+            kinds.setdefault((s.error_detector, steps, s.controller.law, s.plant.vehicle), len(kinds))
+            for s, steps in zip(scenarios, self._steps, strict=True)
+        ]
 
     def units(self, workers: int) -> list[list[Job]]:
         """All runs in parts, seed after seed; several for each worker, if it is not alone, so that none waits long."""
@@ -108,50 +112,57 @@ class _Batch:
         """Run one part; returns the number of its runs."""
         airs = functools.lru_cache(maxsize=4)(ChannelRealisation)
         run = self._with_twins if self._twins else self._by_twos
-        for track, jobs in groupby(sorted(unit, key=lambda job: self._track[job[0]]), lambda job: self._track[job[0]]):
-            reference = self._reference(self._track.index(track))
-            for job, found, contraction in run(reference, list(jobs), airs):
+        for kind, jobs in groupby(sorted(unit, key=lambda job: self._kind[job[0]]), lambda job: self._kind[job[0]]):
+            row = self._kind.index(kind)
+            parts = replacements_of(self._scenarios[row])
+            for job, found, contraction in run(self._reference(row), list(jobs), airs, parts):
                 self.table[job] = (*found, contraction)
         return len(unit)
 
-    def _by_twos(self, reference: Floats, jobs: list[Job], airs: Airs) -> Iterator[tuple[Job, Statistics, float]]:
+    def _by_twos(
+        self, reference: Floats, jobs: list[Job], airs: Airs, parts: Replacements
+    ) -> Iterator[tuple[Job, Statistics, float]]:
         direct = [job for job in jobs if self._is_direct(job)]
         for job in jobs:
             if not self._is_direct(job):
-                yield job, self._on_air(reference, job, airs)[0], math.nan
+                yield job, self._over_links(reference, job, airs, parts)[0], math.nan
         for one, other in zip_longest(direct[::2], direct[1::2]):
             if other is None:
-                yield one, compiled(statistics)(reference, self._case(one, airs)), math.nan
+                yield one, run_parts(statistics, parts, reference, self._case(one, airs)), math.nan
             else:
-                found = compiled(statistics_of_two)(reference, self._case(one, airs), self._case(other, airs))
+                found = run_parts(statistics_of_two, parts, reference, self._case(one, airs), self._case(other, airs))
                 yield one, found[0], math.nan
                 yield other, found[1], math.nan
 
-    def _with_twins(self, reference: Floats, jobs: list[Job], airs: Airs) -> Iterator[tuple[Job, Statistics, float]]:
+    def _with_twins(
+        self, reference: Floats, jobs: list[Job], airs: Airs, parts: Replacements
+    ) -> Iterator[tuple[Job, Statistics, float]]:
         for job in jobs:
-            twin = at_rest(*(value + TWIN_OFFSET for value in self._scenarios[job[0]].plant.initial_pose))
+            twin = start_of(self._scenarios[job[0]], TWIN_OFFSET)
             if self._is_direct(job):
-                yield job, *compiled(statistics_of_twins)(reference, self._case(job, airs), twin)
+                yield job, *run_parts(statistics_of_twins, parts, reference, self._case(job, airs), twin)
             else:
-                found, marks = self._on_air(reference, job, airs)
+                found, marks = self._over_links(reference, job, airs, parts)
                 is_whole = found.steps == self._steps[job[0]]
                 case = self._case(job, airs)
                 yield (
                     job,
                     found,
-                    compiled(contraction_over_links)(reference, case, twin, *marks) if is_whole else math.inf,
+                    run_parts(contraction_over_links, parts, reference, case, twin, *marks) if is_whole else math.inf,
                 )
 
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay
         return relay.uplink.is_direct and relay.downlink.is_direct
 
-    def _on_air(self, reference: Floats, job: Job, airs: Airs) -> tuple[Statistics, tuple[LinkTrace, LinkTrace]]:
+    def _over_links(
+        self, reference: Floats, job: Job, airs: Airs, parts: Replacements
+    ) -> tuple[Statistics, tuple[LinkTrace, LinkTrace]]:
         """One run whose links have to be asked in the loop, and what became of its messages."""
         air, relay, steps = self._air(job, airs), self._scenarios[job[0]].relay, self._steps[job[0]]
         marks = empty_trace(steps), empty_trace(steps)
         ways = air.way(relay.uplink, "uplink"), air.way(relay.downlink, "downlink")
-        return compiled(statistics_over_links)(reference, self._case(job, airs), *ways, *marks), marks
+        return run_parts(statistics_over_links, parts, reference, self._case(job, airs), *ways, *marks), marks
 
     def _air(self, job: Job, airs: Airs) -> ChannelRealisation:
         row, column = job
@@ -159,7 +170,7 @@ class _Batch:
 
     def _reference(self, row: int) -> Floats:
         detector = self._scenarios[row].error_detector
-        reference: Floats = numbers(reference_of(detector, self._steps[row]))
+        reference: Floats = numbers(reference_of(detector, self._steps[row] + detector.steps_ahead))
         return reference
 
     def _case(self, job: Job, airs: Airs) -> RunInputs:
@@ -167,7 +178,7 @@ class _Batch:
         return RunInputs(
             numbers(air.verdicts(scenario.relay.uplink, "uplink")),
             numbers(air.verdicts(scenario.relay.downlink, "downlink")),
-            at_rest(*scenario.plant.initial_pose),
+            start_of(scenario),
             settings_of(scenario),
             numbers(air.normals(NOISE)) if scenario.plant.is_noisy else None,
             numbers(air.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, compiled_with, numbers
+from agv_analysis.compiled import compiled, numbers
 from agv_analysis.simulation.link_loop import LinkInputs
 from agv_analysis.simulation.noise import normals
 from agv_plant.channels import GOOD, MODELS
@@ -108,7 +108,7 @@ class ChannelRealisation:
 
     def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts, states: States) -> None:
         """Ask the channel's model, slot by slot."""
-        judge = compiled_with(judge_all, model=find_model(channel.model))
+        judge = compiled(judge_all, {model: find_model(channel.model)})
         random, state = numbers(self._draws(channel, stream)), GOOD
         for segment, end in _segments(channel, self._steps, self._ts):
             parameters = _Numbers(*(getattr(segment.channel, name) for name in _NUMERIC))

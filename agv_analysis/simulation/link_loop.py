@@ -15,9 +15,12 @@ from numpy.typing import NDArray
 
 from agv_analysis.simulation.loop import (
     EdgeOutput,
+    EdgeState,
     Flags,
+    HeldCommand,
     Loop,
-    MetricsAccumulator,
+    Numbers,
+    PlanState,
     Rows,
     RunInputs,
     Settings,
@@ -25,22 +28,21 @@ from agv_analysis.simulation.loop import (
     apart,
     are_finite,
     begin,
-    commanded,
     edge_step,
     end,
-    expecting,
     goes_on,
     outdated,
     plant_step,
     played,
-    received,
+    reference_at,
+    seen_reference,
     sent_pose,
     update_metrics,
     wheels,
 )
-from agv_cloud.staleness import PREDICT
+from agv_cloud.staleness.estimate import staleness_policy
 from agv_plant.channels.position_dependent import EVERYWHERE, verdict_at
-from agv_plant.vehicle.motion import integrate
+from agv_ros.pose import Pose
 
 
 class LinkInputs(NamedTuple):
@@ -106,83 +108,119 @@ def listen(way: LinkInputs, marks: LinkTrace, places: Rows) -> None:
 # -- one slot ----------------------------------------------------------------------------------------------------------
 
 
+class Past(NamedTuple):
+    """What was sent in a run so far, row k at step k."""
+
+    values: NDArray[np.float64]
+    """Pose that the AGV sent, command, error that it answers: x, y, theta, v, w, x_e, y_e, theta_e, shape (N, 8)."""
+    memory: NDArray[np.float64]
+    """Memory of the control law after the step, shape (N, M)."""
+
+
+def nothing_past(steps: int, memory: Numbers) -> Past:
+    """Of a run of so many steps that has not begun."""
+    return Past(np.empty((steps, 8)), np.empty((steps, len(memory))))
+
+
+def send_pose(past: Past, k: int, loop: Loop, noise: Rows | None, settings: Settings) -> None:
+    """The AGV sends its pose at step k."""
+    pose = sent_pose(loop.motion, noise, k, settings)
+    past.values[k, 0], past.values[k, 1], past.values[k, 2] = pose.x, pose.y, pose.theta
+
+
 def slot_over_links(
-    loop: Loop, k: int, taken: int, ordered: int, reference: Rows, case: RunInputs, past: NDArray[np.float64]
+    loop: Loop, k: int, taken: int, ordered: int, reference: Rows, case: RunInputs, past: Past
 ) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, with the pose of step `taken` at the edge, the command of step `ordered` at the AGV.
 
-    `past` has the poses that were sent, the commands, and the errors that they answer, (x, y, theta, v, w, x_e, y_e,
-    theta_e) in a row, up to the pose of step k; command and error of step k are written into it.
+    `past` is known up to the pose of step k; command and error of step k are written into it.
     """
-    x_r, y_r, theta_r, v_r, w_r = reference[k]
-    held = at_the_edge(loop, k, taken, reference, past, case.settings)
-    sent = edge_step(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-    past[k, 3], past[k, 4] = sent.v, sent.w
-    past[k, 5], past[k, 6], past[k, 7] = sent.x_e, sent.y_e, sent.theta_e
+    settings = case.settings
+    seen = seen_reference(reference_at(reference, k), reference, k, settings.ahead)
+    edge = at_the_edge(loop.edge, k, taken, reference, past, settings)
+    sent, memory = edge_step(edge, seen, settings)
+    row = past.values[k]
+    row[3], row[4], row[5], row[6], row[7] = sent.v, sent.w, sent.x_e, sent.y_e, sent.theta_e
+    store_memory(past.memory[k], memory)
     n_left, n_right = wheels(case.slip, k)
+    held = Loop(loop.motion, edge, loop.command, loop.plan)
     if ordered == k:
-        return plant_step(held, sent, False, n_left, n_right, v_r, w_r, case.settings), sent
-    v, w = past[ordered, 3], past[ordered, 4]
+        return plant_step(held, sent, memory, False, n_left, n_right, seen, settings), sent
+    v, w = past.values[ordered, 3], past.values[ordered, 4]
     if are_finite(v, w, 0.0):  # else the plant has refused it, and goes on with the one before
-        is_news = ordered != k - 1 - loop.n_dl
-        held = commanded(held, v, w, k - 1 - ordered)
+        is_news = ordered != k - 1 - loop.command.n_dl
+        command = HeldCommand(v, w, k - 1 - ordered)
+        plan = loop.plan
         if is_news:
-            held = planned(held, ordered, k, reference, past, case.settings.plan_arc, case.settings)
-    return plant_step(held, sent, True, n_left, n_right, v_r, w_r, case.settings), sent
+            plan = planned(loop, ordered, k, reference, past, settings.plan_arc, settings)
+        held = Loop(loop.motion, edge, command, plan)
+    return plant_step(held, sent, memory, True, n_left, n_right, seen, settings), sent
 
 
 def planned(
-    loop: Loop, ordered: int, k: int, reference: Rows, past: NDArray[np.float64], plan_arc: bool | None,
-    settings: Settings,
-) -> Loop:  # fmt: skip
+    loop: Loop, ordered: int, k: int, reference: Rows, past: Past, plan_arc: bool | None, settings: Settings
+) -> PlanState:
     """The plant holds the plan of step `ordered`, and has come to its step k."""
     if plan_arc is None:
-        return loop
-    sent = EdgeOutput(past[ordered, 5], past[ordered, 6], past[ordered, 7], past[ordered, 3], past[ordered, 4])
-    x, y, theta = loop.x_ahead, loop.y_ahead, loop.theta_ahead
+        return loop.plan
+    row = past.values[ordered]
+    sent = EdgeOutput(row[5], row[6], row[7], row[3], row[4])
+    memory = recall_memory(past.memory[ordered])
+    at_step = loop
     for step in range(ordered, k):
-        _, _, _, v_r, w_r = reference[step]
-        at_step = expecting(loop, x, y, theta)
-        plan = played(at_step, sent, sent.v, sent.w, step - ordered, v_r, w_r, plan_arc, settings)
-        x, y, theta = plan.x_e, plan.y_e, plan.theta_e
-    return expecting(loop, x, y, theta)
+        seen = seen_reference(reference_at(reference, step), reference, step, settings.ahead)
+        command = HeldCommand(sent.v, sent.w, step - ordered)
+        _, _, plan = played(at_step, sent, memory, command, seen, plan_arc, settings)
+        at_step = Loop(loop.motion, loop.edge, loop.command, plan)
+    return at_step.plan
 
 
-def at_the_edge(loop: Loop, k: int, taken: int, reference: Rows, past: NDArray[np.float64], settings: Settings) -> Loop:
-    """The edge holds the pose of step `taken`; if that is news, it goes through its model as far as the step k."""
-    if taken == k - 1 - loop.n_ul:
-        return outdated(loop)
-    x, y, theta = past[taken, 0], past[taken, 1], past[taken, 2]
-    if settings.policy == PREDICT:
-        for step in range(taken, k):
-            v, w = past[step, 3], past[step, 4]
-            if are_finite(v, w, 0.0):
-                x, y, theta = integrate(settings.model_arc, x, y, theta, v, w, settings.ts)
-    return received(loop, x, y, theta, reference[taken][0], reference[taken][1], reference[taken][2], k - taken)
+def recall_memory(row: NDArray[np.float64]) -> Numbers:
+    """A row of numbers as the memory of a control law; as it stands here one that has none. See `parts`."""
+    return ()
+
+
+def store_memory(row: NDArray[np.float64], memory: Numbers) -> None:
+    """The memory of a control law as a row of numbers; as it stands here one that has none. See `parts`."""
+
+
+def at_the_edge(edge: EdgeState, k: int, taken: int, reference: Rows, past: Past, settings: Settings) -> EdgeState:
+    """The edge holds the pose of step `taken`; if that is news, its policy takes it on as far as step k."""
+    if taken == k - 1 - edge.n_ul:
+        return outdated(edge, seen_reference(reference_at(reference, k), reference, k, settings.ahead), settings)
+    row = past.values[taken]
+    then = seen_reference(reference_at(reference, taken), reference, taken, settings.ahead)
+    held, target = Pose(row[0], row[1], row[2]), Pose(then.x, then.y, then.theta)
+    v, w = edge.v, edge.w
+    first = taken if settings.is_stepwise else max(taken, k - 1)
+    for step in range(first, k):
+        if are_finite(past.values[step, 3], past.values[step, 4], 0.0):
+            v, w = past.values[step, 3], past.values[step, 4]
+        seen = seen_reference(reference_at(reference, step + 1), reference, step + 1, settings.ahead)
+        held, target = staleness_policy(
+            settings.policy, held, target, seen, v, w, settings.ts, settings.model_arc, settings.policy_parameters
+        )
+    return EdgeState(held, target, k - taken, edge.v, edge.w, edge.memory)
 
 
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
 
 def history_over_links(
-    reference: Rows,
-    case: RunInputs,
-    up: LinkInputs,
-    down: LinkInputs,
-    up_marks: LinkTrace,
-    down_marks: LinkTrace,
+    reference: Rows, case: RunInputs, up: LinkInputs, down: LinkInputs, up_marks: LinkTrace, down_marks: LinkTrace,
     rows: NDArray[np.float64],
-) -> int:
+) -> int:  # fmt: skip
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), and what became of its messages.
 
-    `reference` has shape (N, 5); the verdicts of `case` mean nothing. Returns the number of slots until the run ended.
+    `reference` as of `loop.history`; the outcomes of `case` mean nothing. Returns the number of slots until the run
+    ended.
     """
-    loop, past = case.start, np.empty((len(rows), 8))
+    loop, past = case.start, nothing_past(len(rows), case.start.edge.memory)
     for k in range(len(rows)):
-        rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
-        past[k, 0], past[k, 1], past[k, 2] = sent_pose(loop, case.noise, k, case.settings)
-        taken = transmit(up, up_marks, k, past[k, 0], past[k, 1])
-        ordered = transmit(down, down_marks, k, past[k, 0], past[k, 1])
+        rows[k, 0], rows[k, 1], rows[k, 2] = loop.motion.x, loop.motion.y, loop.motion.theta
+        send_pose(past, k, loop, case.noise, case.settings)
+        taken = transmit(up, up_marks, k, past.values[k, 0], past.values[k, 1])
+        ordered = transmit(down, down_marks, k, past.values[k, 0], past.values[k, 1])
         loop, sent = slot_over_links(loop, k, taken, ordered, reference, case, past)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
@@ -195,29 +233,16 @@ def statistics_over_links(
     reference: Rows, case: RunInputs, up: LinkInputs, down: LinkInputs, up_marks: LinkTrace, down_marks: LinkTrace
 ) -> Statistics:
     """One run of which only the metrics are kept, and the marks."""
-    run, past = begin(reference, case), np.empty((len(up_marks.held), 8))
-    for k in range(len(past)):
-        past[k, 0], past[k, 1], past[k, 2] = sent_pose(run.loop, case.noise, k, case.settings)
-        taken = transmit(up, up_marks, k, past[k, 0], past[k, 1])
-        ordered = transmit(down, down_marks, k, past[k, 0], past[k, 1])
-        run = proceed_over_links(run, k, taken, ordered, reference, case, past)
+    run, past = begin(reference, case), nothing_past(len(up_marks.held), case.start.edge.memory)
+    for k in range(len(up_marks.held)):
+        send_pose(past, k, run.loop, case.noise, case.settings)
+        taken = transmit(up, up_marks, k, past.values[k, 0], past.values[k, 1])
+        ordered = transmit(down, down_marks, k, past.values[k, 0], past.values[k, 1])
+        loop, sent = slot_over_links(run.loop, k, taken, ordered, reference, case, past)
+        run = update_metrics(run, k, reference_at(reference, k), loop, sent)
         if not run.goes_on:
             break
-    return end(run, reference[0][1] - case.start.y, case.settings.ts)
-
-
-def proceed_over_links(
-    run: MetricsAccumulator,
-    k: int,
-    taken: int,
-    ordered: int,
-    reference: Rows,
-    case: RunInputs,
-    past: NDArray[np.float64],
-) -> MetricsAccumulator:
-    """The run after slot k, as `loop.proceed`."""
-    loop, sent = slot_over_links(run.loop, k, taken, ordered, reference, case, past)
-    return update_metrics(run, k, reference[k][0], reference[k][1], loop, sent)
+    return end(run, reference[0][1] - case.start.motion.y, case.settings.ts)
 
 
 def contraction_over_links(
@@ -227,13 +252,13 @@ def contraction_over_links(
 
     Both meet what was marked when the run was made: the twin loses what the run lost, wherever it is.
     """
-    one, other = case.start, twin
-    past, past_of_twin = np.empty((len(up_marks.held), 8)), np.empty((len(up_marks.held), 8))
-    for k in range(len(past)):
-        past[k, 0], past[k, 1], past[k, 2] = sent_pose(one, case.noise, k, case.settings)
-        past_of_twin[k, 0], past_of_twin[k, 1], past_of_twin[k, 2] = sent_pose(other, case.noise, k, case.settings)
+    one, other, steps = case.start, twin, len(up_marks.held)
+    past, past_of_twin = nothing_past(steps, one.edge.memory), nothing_past(steps, one.edge.memory)
+    for k in range(steps):
+        send_pose(past, k, one, case.noise, case.settings)
+        send_pose(past_of_twin, k, other, case.noise, case.settings)
         one, sent = slot_over_links(one, k, up_marks.held[k], down_marks.held[k], reference, case, past)
         other, said = slot_over_links(other, k, up_marks.held[k], down_marks.held[k], reference, case, past_of_twin)
         if not (goes_on(one, sent) and goes_on(other, said)):
             return math.inf
-    return apart(one, other) / apart(case.start, twin)
+    return apart(one.motion, other.motion) / apart(case.start.motion, twin.motion)

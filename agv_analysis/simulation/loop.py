@@ -5,6 +5,9 @@ detector compares the reference with the freshest pose that it holds, the contro
 command on or loses it, the plant integrates under the freshest command that it holds. Everything here runs both as
 plain Python and compiled, so it keeps to what numba knows: floats, tuples, arrays.
 
+Control law, staleness policy and vehicle are called by placeholders (`control_law`, `staleness_policy`,
+`vehicle_step`), which `parts` replaces by those that a scenario chooses; so a loop is compiled for its own parts.
+
 What a run does not have is None: numba compiles a function anew for it, without the branch that nobody takes. The
 paper's plant thus costs nothing of what can be had beside it.
 """
@@ -18,71 +21,91 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.metrics.convergence import NEGLIGIBLE, SHARE, TOLERANCE
-from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.command import command
 from agv_cloud.control.plan import next_error
-from agv_cloud.staleness import ALIGN, PREDICT
+from agv_cloud.reference.point import ReferencePoint
+from agv_cloud.staleness.estimate import staleness_policy
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import share_of_command
-from agv_plant.vehicle.motion import Body, Motion, integrate, measured, move
+from agv_plant.vehicle.motion import Motion, VehicleParameters, measured, move
+from agv_plant.vehicle.unicycle import integrate
+from agv_ros.pose import Pose
 
 Rows = NDArray[np.float64] | list[list[float]]
 Flags = NDArray[np.bool_] | list[bool]
+Numbers = tuple[float, ...]
 
 
 class Settings(NamedTuple):
-    """What a slot needs to know of the scenario; K_x [1/s], K_y [1/m^2], K_theta [1/m], v_max [m/s], T_s [s]."""
+    """What a slot needs to know of the scenario; v_max [m/s], T_s and look-ahead [s]."""
 
-    kx: float
-    ky: float
-    ktheta: float
+    gains: Numbers
+    """Parameters of the control law, in the order of its signature."""
     v_max: float
     ts: float
+    look_ahead: float
+    ahead: int | None
+    """Steps that the edge looks ahead of the reference of now; None: it does not."""
     arc: bool
     """Does the plant integrate along the arc, or by Euler?"""
     policy: int
-    """Staleness policy at the edge, one of `staleness.HOLD`, `ALIGN`, `PREDICT`."""
+    """Number of the staleness policy, if it is one of this package."""
+    policy_parameters: Numbers
+    is_stepwise: bool
+    """Does the policy go on from its own last step, so that none may be left out?"""
     model_arc: bool
     """The same as `arc`, for the edge's model of the plant."""
     downlink_policy: int
     policy_steps: float
     plan_arc: bool | None
     """The same as `arc`, for the controller's model, if the plant plays its plans."""
-    body: Body | None
+    vehicle: VehicleParameters | None
     """The AGV, if it is not the paper's, which does what it is told."""
     noise_xy: float
     noise_theta: float
 
 
-class Loop(NamedTuple):
-    """The loop between two slots: [m], [rad] in frame `map`, [m/s], [rad/s]."""
+class EdgeState(NamedTuple):
+    """What the edge goes by."""
 
-    x: float
-    y: float
-    theta: float
-    x_held: float
-    """The freshest pose that the edge holds; under `predict`, moved on to the next slot."""
-    y_held: float
-    theta_held: float
-    x_then: float
-    """The reference at the instant of that pose."""
-    y_then: float
-    theta_then: float
+    held: Pose
+    """The pose that it takes for the AGV's."""
+    target: Pose
+    """The pose that it compares this with."""
     n_ul: int
-    """Steps since it was taken."""
+    """Steps since the freshest pose was taken."""
     v: float
-    """The newest command that the plant holds: zero before the first one arrives."""
+    """The command that it sent last."""
+    w: float
+    memory: Numbers
+    """What the control law remembers."""
+
+
+class HeldCommand(NamedTuple):
+    """The newest command that the plant holds [m/s, rad/s]: zero before the first one arrives."""
+
+    v: float
     w: float
     n_dl: int
     """Steps since it was sent."""
-    v_driven: float
-    """The speeds that the plant drove at in the period before."""
-    w_driven: float
-    a_driven: float
-    """Its acceleration in that period."""
-    x_ahead: float
-    """The tracking error that the plan which the plant holds expects of the next step."""
-    y_ahead: float
-    theta_ahead: float
+
+
+class PlanState(NamedTuple):
+    """What the plan that the plant holds expects of the next step: the tracking error, and the law's memory."""
+
+    x_e: float
+    y_e: float
+    theta_e: float
+    memory: Numbers
+
+
+class Loop(NamedTuple):
+    """The loop between two slots."""
+
+    motion: Motion
+    edge: EdgeState
+    command: HeldCommand
+    plan: PlanState
 
 
 class EdgeOutput(NamedTuple):
@@ -96,7 +119,7 @@ class EdgeOutput(NamedTuple):
 
 
 class RunInputs(NamedTuple):
-    """One run: the verdicts of its slots, shape (N,), the loop before slot 0 and its settings."""
+    """One run: the outcomes of its slots, shape (N,), the loop before slot 0 and its settings."""
 
     lost: Flags
     downlink_lost: Flags
@@ -108,36 +131,62 @@ class RunInputs(NamedTuple):
     """The same for the wheels."""
 
 
-def at_rest(x: float, y: float, theta: float) -> Loop:
-    """The loop before slot 0 with the AGV at a pose in frame `map` [m, m, rad]."""
-    return Loop(x, y, theta, x, y, theta, math.nan, math.nan, math.nan, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+def at_rest(x: float, y: float, theta: float, states: Numbers = (), memory: Numbers = ()) -> Loop:
+    """The loop before slot 0 with the AGV at a pose in frame `map` [m, m, rad].
+
+    `states` are those of its vehicle beyond the pose, `memory` what the control law begins with.
+    """
+    pose = Pose(x, y, theta)
+    return Loop(
+        Motion(x, y, theta, 0.0, 0.0, 0.0, states),
+        EdgeState(pose, pose, 0, 0.0, 0.0, memory),
+        HeldCommand(0.0, 0.0, 0),
+        PlanState(0.0, 0.0, 0.0, memory),
+    )
 
 
 # -- one slot ----------------------------------------------------------------------------------------------------------
 
 
-def slot(
-    loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: RunInputs, k: int
-) -> tuple[Loop, EdgeOutput]:
-    """From one pose to the next, under the verdicts of both links on slot k and with the reference at this step."""
+def slot(loop: Loop, reference: ReferencePoint, case: RunInputs, k: int) -> tuple[Loop, EdgeOutput]:
+    """From one pose to the next, under the outcomes of both links in slot k, with the reference as the edge sees it."""
     n_left, n_right = wheels(case.slip, k)
     if case.lost[k]:
-        held = outdated(loop)
-        sent = edge_step(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-        return plant_step(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
+        edge = outdated(loop.edge, reference, case.settings)
+        sent, memory = edge_step(edge, reference, case.settings)
+        held = Loop(loop.motion, edge, loop.command, loop.plan)
+        return plant_step(
+            held, sent, memory, case.downlink_lost[k], n_left, n_right, reference, case.settings
+        ), sent  # fmt: skip
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
-    x, y, theta = sent_pose(loop, case.noise, k, case.settings)
-    held = received(loop, x, y, theta, x_r, y_r, theta_r, 0)
-    sent = edge_step(held, x_r, y_r, theta_r, v_r, w_r, case.settings)
-    return plant_step(held, sent, case.downlink_lost[k], n_left, n_right, v_r, w_r, case.settings), sent
+    edge = received(loop.edge, sent_pose(loop.motion, case.noise, k, case.settings), reference)
+    sent, memory = edge_step(edge, reference, case.settings)
+    held = Loop(loop.motion, edge, loop.command, loop.plan)
+    return plant_step(held, sent, memory, case.downlink_lost[k], n_left, n_right, reference, case.settings), sent
 
 
-def sent_pose(loop: Loop, noise: Rows | None, k: int, settings: Settings) -> tuple[float, float, float]:
+def reference_at(reference: Rows, k: int) -> ReferencePoint:
+    """The reference at step k."""
+    x, y, theta, v, w = reference[k]
+    return ReferencePoint(x, y, theta, v, w)
+
+
+def seen_reference(now: ReferencePoint, reference: Rows, k: int, ahead: int | None) -> ReferencePoint:
+    """The reference that the edge compares with at step k: that of now, or the one that it looks ahead to."""
+    if ahead is None:
+        return now
+    return reference_at(reference, k + ahead)
+
+
+def sent_pose(motion: Motion, noise: Rows | None, k: int, settings: Settings) -> Pose:
     """The pose that the AGV says it has."""
     if noise is None:
-        return loop.x, loop.y, loop.theta
+        return Pose(motion.x, motion.y, motion.theta)
     n_x, n_y, n_theta, _ = noise[k]
-    return measured(loop.x, loop.y, loop.theta, n_x, n_y, n_theta, settings.noise_xy, settings.noise_theta)
+    x, y, theta = measured(
+        motion.x, motion.y, motion.theta, n_x, n_y, n_theta, settings.noise_xy, settings.noise_theta
+    )  # fmt: skip
+    return Pose(x, y, theta)
 
 
 def wheels(slip: Rows | None, k: int) -> tuple[float, float]:
@@ -147,114 +196,90 @@ def wheels(slip: Rows | None, k: int) -> tuple[float, float]:
     return slip[k][0], slip[k][1]
 
 
-def outdated(loop: Loop) -> Loop:
-    """The edge holds what it held before, one step older."""
-    return Loop(
-        loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
-        loop.theta_then, loop.n_ul + 1, loop.v, loop.w, loop.n_dl, loop.v_driven, loop.w_driven,
-        loop.a_driven, loop.x_ahead, loop.y_ahead, loop.theta_ahead,
+def outdated(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> EdgeState:
+    """No pose has come: what the edge holds is one step older, and its policy says what to make of it."""
+    held, target = staleness_policy(
+        settings.policy, edge.held, edge.target, reference, edge.v, edge.w, settings.ts, settings.model_arc,
+        settings.policy_parameters,
     )  # fmt: skip
+    return EdgeState(held, target, edge.n_ul + 1, edge.v, edge.w, edge.memory)
 
 
-def received(
-    loop: Loop, x: float, y: float, theta: float, x_then: float, y_then: float, theta_then: float, n_ul: int
-) -> Loop:
-    """The edge holds a pose that was taken n_ul steps ago, when the reference was at (x_then, y_then, theta_then)."""
-    return Loop(
-        loop.x, loop.y, loop.theta, x, y, theta, x_then, y_then, theta_then, n_ul, loop.v, loop.w, loop.n_dl,
-        loop.v_driven, loop.w_driven, loop.a_driven, loop.x_ahead, loop.y_ahead, loop.theta_ahead,
-    )  # fmt: skip
+def received(edge: EdgeState, pose: Pose, reference: ReferencePoint) -> EdgeState:
+    """The edge holds the pose of now."""
+    return EdgeState(pose, Pose(reference.x, reference.y, reference.theta), 0, edge.v, edge.w, edge.memory)
 
 
-def commanded(loop: Loop, v: float, w: float, n_dl: int) -> Loop:
-    """The plant holds a command that was sent n_dl steps ago [m/s, rad/s]."""
-    return Loop(
-        loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
-        loop.theta_then, loop.n_ul, v, w, n_dl, loop.v_driven, loop.w_driven, loop.a_driven, loop.x_ahead, loop.y_ahead,
-        loop.theta_ahead,
-    )  # fmt: skip
-
-
-def expecting(loop: Loop, x_ahead: float, y_ahead: float, theta_ahead: float) -> Loop:
-    """The plan that the plant holds expects this error of the next step."""
-    return Loop(
-        loop.x, loop.y, loop.theta, loop.x_held, loop.y_held, loop.theta_held, loop.x_then, loop.y_then,
-        loop.theta_then, loop.n_ul, loop.v, loop.w, loop.n_dl, loop.v_driven, loop.w_driven, loop.a_driven, x_ahead,
-        y_ahead, theta_ahead,
-    )  # fmt: skip
-
-
-def edge_step(
-    loop: Loop, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, settings: Settings
-) -> EdgeOutput:
-    """The edge's answer, from the pose that it holds.
+def edge_step(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> tuple[EdgeOutput, Numbers]:
+    """The edge's answer, from the pose that it holds, and what the control law remembers after it.
 
     An error beyond the range of numbers is refused by the controller, as it comes in from the wire.
     """
-    if settings.policy == ALIGN:
-        x_r, y_r, theta_r = loop.x_then, loop.y_then, loop.theta_then
-    x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, loop.x_held, loop.y_held, loop.theta_held)
+    held, target = edge.held, edge.target
+    x_e, y_e, theta_e = tracking_error(target.x, target.y, target.theta, held.x, held.y, held.theta)
     if not are_finite(x_e, y_e, theta_e):
-        return EdgeOutput(x_e, y_e, theta_e, math.nan, math.nan)
-    v, w = control_law(x_e, y_e, theta_e, v_r, w_r, settings.kx, settings.ky, settings.ktheta)
-    return EdgeOutput(x_e, y_e, theta_e, limit_speed(v, settings.v_max), w)
+        return EdgeOutput(x_e, y_e, theta_e, math.nan, math.nan), edge.memory
+    v, w, memory = command(
+        x_e, y_e, theta_e, reference.v, reference.w, edge.memory, settings.gains, settings.ts, settings.look_ahead,
+        settings.v_max,
+    )  # fmt: skip
+    return EdgeOutput(x_e, y_e, theta_e, v, w), memory
 
 
 def plant_step(
-    loop: Loop, sent: EdgeOutput, lost: bool, n_left: float, n_right: float, v_r: float, w_r: float, settings: Settings
-) -> Loop:
-    """One sampling period of the plant under the freshest command, and of the edge's model under the one it sent.
+    loop: Loop, sent: EdgeOutput, memory: Numbers, lost: bool, n_left: float, n_right: float,
+    reference: ReferencePoint, settings: Settings,
+) -> Loop:  # fmt: skip
+    """One sampling period of the plant under the freshest command; the edge keeps in mind what it sent.
 
-    n_left and n_right are the wheels' normal numbers, v_r and w_r the reference's speeds, as a plan knows them. A
-    command beyond the range of numbers is refused by the plant, which goes on with the one before.
+    n_left and n_right are the wheels' normal numbers; `memory` is the control law's after this step. A command beyond
+    the range of numbers is refused by the plant, which goes on with the one before.
     """
-    v, w, n_dl = sent.v, sent.w, 0
-    if lost or not are_finite(v, w, 0.0):
-        v, w, n_dl = loop.v, loop.w, loop.n_dl + 1
-    plan = played(loop, sent, v, w, n_dl, v_r, w_r, settings.plan_arc, settings)
-    moved = period(loop, plan.v, plan.w, n_dl, n_left, n_right, settings.body, settings)
-    x_held, y_held, theta_held = loop.x_held, loop.y_held, loop.theta_held
-    if settings.policy == PREDICT and are_finite(sent.v, sent.w, 0.0):
-        x_held, y_held, theta_held = integrate(
-            settings.model_arc, x_held, y_held, theta_held, sent.v, sent.w, settings.ts
-        )
-    return Loop(
-        moved.x, moved.y, moved.theta, x_held, y_held, theta_held, loop.x_then, loop.y_then, loop.theta_then, loop.n_ul,
-        v, w, n_dl, moved.v, moved.w, moved.a, plan.x_e, plan.y_e, plan.theta_e,
-    )  # fmt: skip
+    edge, held = loop.edge, HeldCommand(sent.v, sent.w, 0)
+    is_finite = are_finite(sent.v, sent.w, 0.0)
+    if is_finite:
+        edge = EdgeState(edge.held, edge.target, edge.n_ul, sent.v, sent.w, memory)
+    if lost or not is_finite:
+        held = HeldCommand(loop.command.v, loop.command.w, loop.command.n_dl + 1)
+    v, w, plan = played(loop, sent, memory, held, reference, settings.plan_arc, settings)
+    return Loop(period(loop.motion, v, w, held.n_dl, n_left, n_right, settings.vehicle, settings), edge, held, plan)
 
 
 def played(
-    loop: Loop, sent: EdgeOutput, v: float, w: float, n_dl: int, v_r: float, w_r: float, plan_arc: bool | None,
-    settings: Settings,
-) -> EdgeOutput:  # fmt: skip
-    """What the plant drives, n_dl steps after (v, w) was sent, and the error that its plan expects of the next step."""
+    loop: Loop, sent: EdgeOutput, memory: Numbers, held: HeldCommand, reference: ReferencePoint,
+    plan_arc: bool | None, settings: Settings,
+) -> tuple[float, float, PlanState]:  # fmt: skip
+    """What the plant drives under the command that it holds, and what its plan expects of the next step."""
     if plan_arc is None:
-        return EdgeOutput(loop.x_ahead, loop.y_ahead, loop.theta_ahead, v, w)
+        return held.v, held.w, loop.plan
+    v, w = held.v, held.w
     x_e, y_e, theta_e = sent.x_e, sent.y_e, sent.theta_e
-    if n_dl > 0:
-        x_e, y_e, theta_e = loop.x_ahead, loop.y_ahead, loop.theta_ahead
-        v, w = control_law(x_e, y_e, theta_e, v_r, w_r, settings.kx, settings.ky, settings.ktheta)
-        v = limit_speed(v, settings.v_max)
-    x_e, y_e, theta_e = next_error(x_e, y_e, theta_e, v, w, v_r, w_r, settings.ts, plan_arc)
-    return EdgeOutput(x_e, y_e, theta_e, v, w)
+    if held.n_dl > 0:
+        x_e, y_e, theta_e = loop.plan.x_e, loop.plan.y_e, loop.plan.theta_e
+        v, w, memory = command(
+            x_e, y_e, theta_e, reference.v, reference.w, loop.plan.memory, settings.gains, settings.ts,
+            settings.look_ahead, settings.v_max,
+        )  # fmt: skip
+    x_e, y_e, theta_e = next_error(x_e, y_e, theta_e, v, w, reference.v, reference.w, settings.ts, plan_arc)
+    return v, w, PlanState(x_e, y_e, theta_e, memory)
 
 
 def period(
-    loop: Loop, v: float, w: float, n_dl: int, n_left: float, n_right: float, body: Body | None, settings: Settings
-) -> Motion:
+    motion: Motion, v: float, w: float, n_dl: int, n_left: float, n_right: float, vehicle: VehicleParameters | None,
+    settings: Settings,
+) -> Motion:  # fmt: skip
     """The plant's motion in a period under a command (v, w) that was sent n_dl steps ago."""
-    if body is None:
-        x, y, theta = integrate(settings.arc, loop.x, loop.y, loop.theta, v, w, settings.ts)
-        return Motion(x, y, theta, v, w, 0.0)
+    if vehicle is None:
+        x, y, theta = integrate(settings.arc, motion.x, motion.y, motion.theta, v, w, settings.ts)
+        return Motion(x, y, theta, v, w, 0.0, motion.states)
     share = share_of_command(n_dl, settings.downlink_policy, settings.policy_steps)
-    before = Motion(loop.x, loop.y, loop.theta, loop.v_driven, loop.w_driven, loop.a_driven)
-    return move(before, share * v, share * w, n_left, n_right, body)
+    return move(motion, share * v, share * w, n_left, n_right, vehicle)
 
 
 def goes_on(loop: Loop, sent: EdgeOutput) -> bool:
     """Is there a next slot? Not after a pose beyond the range of numbers, nor if the edge sent no command."""
-    return are_finite(loop.x, loop.y, loop.theta) and are_finite(sent.x_e, sent.y_e, sent.theta_e)
+    motion = loop.motion
+    return are_finite(motion.x, motion.y, motion.theta) and are_finite(sent.x_e, sent.y_e, sent.theta_e)
 
 
 def are_finite(a: float, b: float, c: float) -> bool:
@@ -268,16 +293,17 @@ def are_finite(a: float, b: float, c: float) -> bool:
 def history(reference: Rows, case: RunInputs, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), its age into n_ul[k], shape (N,).
 
-    `reference` has shape (N, 5). Returns the number of slots until the run ended, N at most.
+    `reference` has shape (N, 5), or as many rows more as the edge looks ahead. Returns the number of slots until the
+    run ended, N at most.
     """
     loop = case.start
     for k in range(len(case.lost)):
-        x_r, y_r, theta_r, v_r, w_r = reference[k]
-        rows[k, 0], rows[k, 1], rows[k, 2] = loop.x, loop.y, loop.theta
-        loop, sent = slot(loop, x_r, y_r, theta_r, v_r, w_r, case, k)
+        now = reference_at(reference, k)
+        rows[k, 0], rows[k, 1], rows[k, 2] = loop.motion.x, loop.motion.y, loop.motion.theta
+        loop, sent = slot(loop, seen_reference(now, reference, k, case.settings.ahead), case, k)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
-        n_ul[k] = loop.n_ul
+        n_ul[k] = loop.edge.n_ul
         if not goes_on(loop, sent):
             return k + 1
     return len(case.lost)
@@ -329,23 +355,23 @@ class MetricsAccumulator(NamedTuple):
 
 def begin(reference: Rows, case: RunInputs) -> MetricsAccumulator:
     """A run before slot 0."""
-    band = SHARE * abs(reference[0][1] - case.start.y)
+    band = SHARE * abs(reference[0][1] - case.start.motion.y)
     return MetricsAccumulator(case.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
 def proceed(
-    run: MetricsAccumulator, k: int, x_r: float, y_r: float, theta_r: float, v_r: float, w_r: float, case: RunInputs
+    run: MetricsAccumulator, k: int, now: ReferencePoint, seen: ReferencePoint, case: RunInputs
 ) -> MetricsAccumulator:
-    """The run after slot k."""
-    loop, sent = slot(run.loop, x_r, y_r, theta_r, v_r, w_r, case, k)
-    return update_metrics(run, k, x_r, y_r, loop, sent)
+    """The run after slot k, at which the reference is at `now`, and the edge compares with `seen`."""
+    loop, sent = slot(run.loop, seen, case, k)
+    return update_metrics(run, k, now, loop, sent)
 
 
 def update_metrics(
-    run: MetricsAccumulator, k: int, x_r: float, y_r: float, loop: Loop, sent: EdgeOutput
+    run: MetricsAccumulator, k: int, now: ReferencePoint, loop: Loop, sent: EdgeOutput
 ) -> MetricsAccumulator:
-    """The run after slot k, at which the reference was at (x_r, y_r), from the loop after it and what the edge sent."""
-    dx, e = x_r - run.loop.x, y_r - run.loop.y
+    """The run after slot k, from the loop after it and what the edge sent."""
+    dx, e = now.x - run.loop.motion.x, now.y - run.loop.motion.y
     size, square = abs(e), dx * dx + e * e
     return MetricsAccumulator(
         loop,
@@ -361,8 +387,8 @@ def update_metrics(
         run.ise + e * e,
         square,
         max(run.farthest, square),
-        max(run.n_ul_max, loop.n_ul),
-        run.n_ul_sum + loop.n_ul,
+        max(run.n_ul_max, loop.edge.n_ul),
+        run.n_ul_sum + loop.edge.n_ul,
     )
 
 
@@ -387,14 +413,14 @@ def end(run: MetricsAccumulator, initial: float, ts: float) -> Statistics:
 
 
 def statistics(reference: Rows, case: RunInputs) -> Statistics:
-    """One run of which only the metrics are kept; `reference` has shape (N, 5)."""
+    """One run of which only the metrics are kept; `reference` as of `history`."""
     run = begin(reference, case)
     for k in range(len(case.lost)):
-        x_r, y_r, theta_r, v_r, w_r = reference[k]
-        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, case)
+        now = reference_at(reference, k)
+        run = proceed(run, k, now, seen_reference(now, reference, k, case.settings.ahead), case)
         if not run.goes_on:
             break
-    return end(run, reference[0][1] - case.start.y, case.settings.ts)
+    return end(run, reference[0][1] - case.start.motion.y, case.settings.ts)
 
 
 def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[Statistics, Statistics]:
@@ -404,13 +430,16 @@ def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tupl
     """
     first, second = begin(reference, one), begin(reference, other)
     for k in range(len(one.lost)):
-        x_r, y_r, theta_r, v_r, w_r = reference[k]
+        now = reference_at(reference, k)
         if first.goes_on:
-            first = proceed(first, k, x_r, y_r, theta_r, v_r, w_r, one)
+            first = proceed(first, k, now, seen_reference(now, reference, k, one.settings.ahead), one)
         if second.goes_on:
-            second = proceed(second, k, x_r, y_r, theta_r, v_r, w_r, other)
+            second = proceed(second, k, now, seen_reference(now, reference, k, other.settings.ahead), other)
     y_r = reference[0][1]
-    return end(first, y_r - one.start.y, one.settings.ts), end(second, y_r - other.start.y, other.settings.ts)
+    return (
+        end(first, y_r - one.start.motion.y, one.settings.ts),
+        end(second, y_r - other.start.motion.y, other.settings.ts),
+    )
 
 
 def statistics_of_twins(reference: Rows, case: RunInputs, twin: Loop) -> tuple[Statistics, float]:
@@ -421,19 +450,20 @@ def statistics_of_twins(reference: Rows, case: RunInputs, twin: Loop) -> tuple[S
     """
     run, begun, ends = begin(reference, case), twin, False
     for k in range(len(case.lost)):
-        x_r, y_r, theta_r, v_r, w_r = reference[k]
-        run = proceed(run, k, x_r, y_r, theta_r, v_r, w_r, case)
+        now = reference_at(reference, k)
+        seen = seen_reference(now, reference, k, case.settings.ahead)
+        run = proceed(run, k, now, seen, case)
         if not ends:
-            twin, sent = slot(twin, x_r, y_r, theta_r, v_r, w_r, case, k)
+            twin, sent = slot(twin, seen, case, k)
             ends = not goes_on(twin, sent)
         if not run.goes_on:
             break
-    found = end(run, reference[0][1] - case.start.y, case.settings.ts)
+    found = end(run, reference[0][1] - case.start.motion.y, case.settings.ts)
     if ends or not run.goes_on:
         return found, math.inf
-    return found, apart(run.loop, twin) / apart(case.start, begun)
+    return found, apart(run.loop.motion, twin.motion) / apart(case.start.motion, begun.motion)
 
 
-def apart(one: Loop, other: Loop) -> float:
-    """Distance of two AGVs in (x, y, theta) [m, m, rad], a radian counting as a meter."""
+def apart(one: Motion, other: Motion) -> float:
+    """Distance of two AGVs in (x, y, theta) [m, m, rad], a radian counting as a metre."""
     return math.hypot(math.hypot(one.x - other.x, one.y - other.y), one.theta - other.theta)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.compiled import compiled_with
+from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference.reference import Reference, lap_steps
@@ -29,7 +29,7 @@ def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -
     if detector.track not in TRACKS:
         return Reference(detector).first(steps)
     points = np.empty((steps, 5))
-    drive = compiled_with(drive_all, track=TRACKS[detector.track])
+    drive = compiled(drive_all, {track: TRACKS[detector.track]})
     drive(points, detector.track_start, lap_steps(detector), detector.ts, detector.speed)
     return points
 

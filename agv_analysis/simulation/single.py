@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -10,17 +11,22 @@ from agv_analysis.compiled import compiled, numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import history_over_links
-from agv_analysis.simulation.loop import Rows, RunInputs, Settings, at_rest, history
+from agv_analysis.simulation.loop import Loop, Rows, RunInputs, Settings, at_rest, history
 from agv_analysis.simulation.noise import measurements, normals
+from agv_analysis.simulation.parts import replacements_of
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.simulated_link import SimulatedLink
-from agv_cloud.staleness import POLICIES
+from agv_cloud.control.registry import CONTROL_LAWS
+from agv_cloud.staleness.estimate import is_stepwise
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.parameters import PlantParameters
-from agv_plant.vehicle.motion import NOISE, SLIP, body_of
+from agv_plant.vehicle.motion import NOISE, SLIP, vehicle_parameters
+from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_ros.errors import UserError
+from agv_ros.substitution import Replacements, replaced
 
-_PAPERS_BODY = body_of(PlantParameters())
+_PAPERS_VEHICLE = vehicle_parameters(PlantParameters())
 
 
 def simulate(scenario: Scenario) -> Run:
@@ -30,7 +36,7 @@ def simulate(scenario: Scenario) -> Run:
     ends there, and its run says so in its notes.
     """
     steps, relay, plant = steps_of(scenario), scenario.relay, scenario.plant
-    reference = reference_of(scenario.error_detector, steps).copy()
+    reference = reference_of(scenario.error_detector, steps + scenario.controller.steps_ahead).copy()
     up, down = (
         SimulatedLink(channel, relay.seed, name, steps, plant.ts)
         for name, channel in (("uplink", relay.uplink), ("downlink", relay.downlink))
@@ -38,8 +44,10 @@ def simulate(scenario: Scenario) -> Run:
     settings = settings_of(scenario)
     noise = numbers(normals(plant.seed, NOISE, steps)) if plant.is_noisy else None
     slip = numbers(normals(plant.seed, SLIP, steps)) if plant.slip_noise > 0.0 else None
-    start, lost = at_rest(*plant.initial_pose), (numbers(up.lost), numbers(down.lost))
-    rows, done = _drive(numbers(reference), RunInputs(*lost, start, settings, noise, slip), up, down)
+    lost = numbers(up.lost), numbers(down.lost)
+    inputs = RunInputs(*lost, start_of(scenario), settings, noise, slip)
+    rows, done = _drive(numbers(reference), inputs, up, down, replacements_of(scenario))
+    check_commands(scenario, rows[:done, 3:8])
     pose, k = rows[:done, 0:3], np.arange(done)
     return Run(
         scenario=scenario,
@@ -59,15 +67,59 @@ def simulate(scenario: Scenario) -> Run:
     )
 
 
-def _drive(reference: Rows, case: RunInputs, up: SimulatedLink, down: SimulatedLink) -> tuple[Floats, int]:
+def _drive(
+    reference: Rows, inputs: RunInputs, up: SimulatedLink, down: SimulatedLink, parts: Replacements
+) -> tuple[Floats, int]:
     """X_c, eps and u of a run's slots, shape (N, 8), and the number of slots until it ended; the links get their marks.
 
-    Where a message that is not lost is there at once, verdicts known beforehand are all that is needed of the radio.
+    Where a message that is not lost is there at once, outcomes known beforehand are all that is needed of the radio.
     """
-    rows = np.empty((len(reference), 8))
+    rows = np.empty((len(inputs.lost), 8))
     if up.is_direct and down.is_direct:
-        return rows, compiled(history)(reference, case, rows, np.empty(len(rows), dtype=np.int64))
-    return rows, compiled(history_over_links)(reference, case, up.way, down.way, up.marks, down.marks, rows)
+        n_ul = np.empty(len(rows), dtype=np.int64)
+        return rows, run_parts(history, parts, reference, inputs, rows, n_ul)
+    links = up.way, down.way, up.marks, down.marks
+    return rows, run_parts(history_over_links, parts, reference, inputs, *links, rows)
+
+
+def run_parts(loop: Any, parts: Replacements, *arguments: Any) -> Any:
+    """A loop with its parts, compiled; as plain Python where another package's part is more than numba compiles.
+
+    Raises UserError if such a part raises.
+    """
+    try:
+        return compiled(loop, parts)(*arguments)
+    except Exception as error:
+        if not parts:
+            raise
+        try:
+            return replaced(loop, parts)(*arguments)
+        except Exception as again:
+            names = ", ".join(sorted(part.__name__ for part in parts.values()))
+            raise UserError(f"a part of the loop ({names}) raises {type(again).__name__}: {again}") from error
+
+
+def check_commands(scenario: Scenario, rows: Floats) -> None:
+    """Raises UserError where the control law made no number of a finite error; rows of eps and u, shape (N, 5)."""
+    usable = np.isfinite(rows[:, :3]).all(axis=1) & (np.abs(rows[:, :3]) < LARGEST_ERROR).all(axis=1)
+    wrong = np.flatnonzero(usable & np.isnan(rows[:, 3:]).any(axis=1))
+    if len(wrong):
+        k = int(wrong[0])
+        raise UserError(
+            f"{CONTROL_LAWS.where(scenario.controller.law)} returns NaN at step {k}, for the error "
+            f"{tuple(rows[k, :3].tolist())}"
+        )
+
+
+LARGEST_ERROR = 1e100
+"""Beyond this [m] a loop has diverged, and a law may compute with infinity."""
+
+
+def start_of(scenario: Scenario, offset: float = 0.0) -> Loop:
+    """The loop of a scenario before slot 0, its AGV `offset` [m, m, rad] away from its initial pose."""
+    x, y, theta = (value + offset for value in scenario.plant.initial_pose)
+    vehicle, law = VEHICLES.find(scenario.plant.vehicle), CONTROL_LAWS.find(scenario.controller.law)
+    return at_rest(x, y, theta, (0.0,) * len(vehicle.states), law.memory)
 
 
 def steps_of(scenario: Scenario) -> int:
@@ -82,20 +134,24 @@ def steps_of(scenario: Scenario) -> int:
 
 def settings_of(scenario: Scenario) -> Settings:
     """What a slot of the loop needs to know of a scenario."""
-    gains, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
-    body = body_of(plant)
+    controller, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
+    vehicle = vehicle_parameters(plant)
     is_paper = (
-        plant.downlink_policy == "hold" and body._replace(arc=_PAPERS_BODY.arc, ts=_PAPERS_BODY.ts) == _PAPERS_BODY
+        plant.vehicle == UNICYCLE
+        and plant.downlink_policy == "hold"
+        and vehicle._replace(arc=_PAPERS_VEHICLE.arc, ts=_PAPERS_VEHICLE.ts) == _PAPERS_VEHICLE
     )
+    policy = STALENESS_POLICIES.names().index(edge.policy)
     return Settings(
-        kx=gains.kx, ky=gains.ky, ktheta=gains.ktheta, v_max=gains.v_max, ts=plant.ts,
+        gains=controller.gains, v_max=controller.v_max, ts=plant.ts,
+        look_ahead=controller.look_ahead, ahead=controller.steps_ahead or None,
         arc=plant.integration == "arc",
-        policy=POLICIES.index(edge.policy),
+        policy=policy, policy_parameters=edge.policy_values, is_stepwise=is_stepwise(policy),
         model_arc=edge.integration == "arc",
         downlink_policy=DOWNLINK_POLICIES.index(plant.downlink_policy),
         policy_steps=plant.policy_steps,
-        plan_arc=gains.integration == "arc" if plant.downlink_policy == "buffer" else None,
-        body=None if is_paper else body,
+        plan_arc=controller.integration == "arc" if plant.downlink_policy == "buffer" else None,
+        vehicle=None if is_paper else vehicle,
         noise_xy=plant.noise_xy, noise_theta=plant.noise_theta,
     )  # fmt: skip
 

@@ -34,7 +34,8 @@ from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.products import multiply
-from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.command import limit_speed
+from agv_cloud.control.kanayama import kanayama
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
 
@@ -163,7 +164,7 @@ def loop_jacobians(
     """Derivatives of X_c(k+1) with respect to X_c(k) and to X_c(k-n), about any motion; each of shape (N, 3, 3).
 
     `pose` = X_c(k) and `held` = X_c(k-n) of shape (N, 3), `reference` = x, y, theta, v_r, w_r at step k, shape (N, 5),
-    frame `map`. For Euler's step (the paper's eq. 100) under `control_law` and `limit_speed`; a command at the limit
+    frame `map`. For Euler's step (the paper's eq. 100) under `kanayama` and `limit_speed`; a command at the limit
     does not answer to the error along the track. A(k) of eq. 55 is their sum at zero error.
     """
     theta, v_r = pose[:, 2], reference[:, 3]
@@ -186,5 +187,5 @@ def _answer(reference: Floats, held: Floats, gains: ControllerParameters) -> tup
     """The error that the edge sees at one step, and the speed that it commands."""
     x_r, y_r, theta_r, v_r, w_r = reference.tolist()
     x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, *held.tolist())
-    v, _ = control_law(x_e, y_e, theta_e, v_r, w_r, gains.kx, gains.ky, gains.ktheta)
+    v, _ = kanayama(x_e, y_e, theta_e, v_r, w_r, gains.kx, gains.ky, gains.ktheta)
     return x_e, y_e, theta_e, limit_speed(v, gains.v_max)

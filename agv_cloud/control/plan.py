@@ -12,11 +12,11 @@ Quevedo and Nesic, Input-to-state stability of packetized predictive control ove
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
-from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.command import Gains, Memory, command
 from agv_cloud.tracking_error import tracking_error
-from agv_plant.vehicle.motion import integrate
-from agv_plant.vehicle.unicycle import euler_step
+from agv_plant.vehicle.unicycle import euler_step, integrate
 
 
 def next_error(
@@ -32,17 +32,19 @@ def next_error(
 
 
 def planned_commands(
-    error: tuple[float, float, float],
-    speeds: Iterable[tuple[float, float]],
-    gains: tuple[float, float, float],
-    v_max: float,
-    ts: float,
-    arc: bool,
-) -> list[tuple[float, float]]:
-    """Commands (v, w) from now on, one for each of the reference's `speeds` (v_r, w_r), the first for `error`."""
-    commands = []
+    error: tuple[float, float, float], speeds: Iterable[tuple[float, float]], memory: Memory, gains: Gains, ts: float,
+    look_ahead: float, v_max: float, arc: bool, answer: Any = command,
+) -> tuple[list[tuple[float, float]], Memory]:  # fmt: skip
+    """Commands (v, w) from now on, one for each of the reference's `speeds` (v_r, w_r), the first for `error`.
+
+    `answer` is `command` with the chosen law in it. Beside them the law's memory after the first of them, for the next
+    step.
+    """
+    commands: list[tuple[float, float]] = []
+    after_first = ahead = memory
     for v_r, w_r in speeds:
-        v, w = control_law(*error, v_r, w_r, *gains)
-        commands.append((limit_speed(v, v_max), w))
-        error = next_error(*error, *commands[-1], v_r, w_r, ts, arc)
-    return commands
+        v, w, ahead = answer(*error, v_r, w_r, ahead, gains, ts, look_ahead, v_max)
+        after_first = after_first if commands else ahead
+        commands.append((v, w))
+        error = next_error(*error, v, w, v_r, w_r, ts, arc)
+    return commands, after_first

@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from agv_cloud.reference.reference import ReferencePoint
+from agv_cloud.reference.point import ReferencePoint
 from agv_plant.vehicle.unicycle import arc_step
 
 Point = tuple[float, float]

@@ -7,26 +7,16 @@ command stays on it to the last bit. A reference sampled from continuous time wo
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_cloud.parameters import CSV, PATH, ErrorDetectorParameters
+from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.reference.track_file import load_track
 from agv_cloud.reference.tracks import TRACKS, Speeds
 from agv_plant.vehicle.unicycle import euler_step
 from agv_ros.errors import UserError
-
-
-class ReferencePoint(NamedTuple):
-    """The reference at one step: posture in frame `map` [m, m, rad] and speeds [m/s, rad/s]."""
-
-    x: float
-    y: float
-    theta: float
-    v: float
-    w: float
 
 
 def speeds_of(parameters: ErrorDetectorParameters) -> Callable[[int], Speeds]:

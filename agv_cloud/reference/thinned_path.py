@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference.path_track import PathTrack
-from agv_cloud.reference.reference import Reference, ReferencePoint, lap_steps
+from agv_cloud.reference.point import ReferencePoint
+from agv_cloud.reference.reference import Reference, lap_steps
 
 LONGEST = 50_000
 """Steps that are looked at, at most: a node should not take long to come up."""

@@ -31,3 +31,15 @@ def arc_step(x: float, y: float, theta: float, v: float, w: float, ts: float) ->
 
 
 STEPS = {"euler": euler_step, "arc": arc_step}
+
+
+def integrate(arc: bool, x: float, y: float, theta: float, v: float, w: float, ts: float) -> tuple[float, float, float]:
+    """One sampling period along the arc, or by Euler's step."""
+    if arc:
+        return arc_step(x, y, theta, v, w, ts)
+    return euler_step(x, y, theta, v, w, ts)
+
+
+def unicycle(x: float, y: float, theta: float, v: float, w: float, dt: float, arc: bool) -> tuple[float, float, float]:
+    """Pose [m, m, rad] a time `dt` [s] later at the speeds v [m/s], w [rad/s], which the vehicle takes up at once."""
+    return integrate(arc, x, y, theta, v, w, dt)

@@ -58,7 +58,7 @@ def test_compiled_and_plain_agree_to_the_last_bit(settings: tuple[str, ...]) -> 
     assert rows.tobytes() == np.hstack([run.pose, run.error, run.command]).tobytes()
     assert n_ul.tolist() == run.n_ul.tolist()
     assert statistics(reference, plain) == compiled(statistics)(run.reference, fast)
-    slower = fast._replace(settings=numbers._replace(kx=5.0))
+    slower = fast._replace(settings=numbers._replace(gains=(5.0, *numbers.gains[1:])))
     both = compiled(statistics_of_two)(run.reference, fast, slower)
     assert both == (compiled(statistics)(run.reference, fast), compiled(statistics)(run.reference, slower))
 

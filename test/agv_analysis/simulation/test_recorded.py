@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agv_analysis.simulation import simulate
-from agv_cloud.staleness import POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 
 if TYPE_CHECKING:
@@ -112,12 +112,12 @@ def files(tmp_path: Path) -> tuple[str, str]:
 @pytest.mark.no_cover
 @pytest.mark.parametrize("limit", LIMITED.values(), ids=LIMITED)
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("policy", STALENESS_POLICIES.names())
 def test_every_channel_policy_and_limit(
     drive: Callable[..., Run], files: tuple[str, str], policy: str, channel: tuple[str, ...], limit: str
 ) -> None:
     """Each with a track and a downlink policy of its own turn, so that all of them meet every other kind."""
-    turn = list(CHANNELS.values()).index(channel) + POLICIES.index(policy)
+    turn = list(CHANNELS.values()).index(channel) + STALENESS_POLICIES.names().index(policy)
     downlink = DOWNLINK_POLICIES[turn % len(DOWNLINK_POLICIES)]
     settings = (*files, f"error_detector.track={TRACKS[turn % len(TRACKS)]}", f"plant.downlink_policy={downlink}")
     planned = ("plant.plan_steps=2",) if downlink == "buffer" else ()

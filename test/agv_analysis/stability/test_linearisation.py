@@ -19,7 +19,8 @@ from agv_analysis.stability.linearisation import (
     step_matrices,
 )
 from agv_analysis.stability.paper import matrices
-from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.command import limit_speed
+from agv_cloud.control.kanayama import kanayama
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.vehicle.unicycle import euler_step
@@ -42,7 +43,7 @@ def next_error(now: Floats, outdated: Floats, v: float, w: float, by: Controller
     reference = Pose(2.0, -1.0, 0.7)
     plant = off_by(reference, now)
     seen = tracking_error(*reference, *off_by(reference, outdated))
-    command = control_law(*seen, v, w, by.kx, by.ky, by.ktheta)
+    command = kanayama(*seen, v, w, by.kx, by.ky, by.ktheta)
     return np.array(tracking_error(*euler_step(*reference, v, w, TS), *euler_step(*plant, *command, TS)))
 
 
@@ -76,7 +77,7 @@ def test_the_shapes_follow_the_speeds() -> None:
 def step(pose: Floats, held: Floats, reference: Floats, by: ControllerParameters) -> Floats:
     x_r, y_r, theta_r, v_r, w_r = reference.tolist()
     error = tracking_error(x_r, y_r, theta_r, *held.tolist())
-    v, w = control_law(*error, v_r, w_r, by.kx, by.ky, by.ktheta)
+    v, w = kanayama(*error, v_r, w_r, by.kx, by.ky, by.ktheta)
     x, y, theta = pose.tolist()
     return np.array(euler_step(x, y, theta, limit_speed(v, by.v_max), w, TS))
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability import almost_sure
 from agv_analysis.stability.paper import largest_n, matrices, spectral_radii
-from agv_cloud.control.kanayama import control_law
+from agv_cloud.control.kanayama import kanayama
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference.reference import Reference
 from agv_cloud.tracking_error import tracking_error
@@ -32,7 +32,7 @@ def step(pose: Floats, held: Floats, reference: Floats, by: ControllerParameters
     """X_c(k+1) of the loop for the poses X_c(k) and X_c(k-n)."""
     x_r, y_r, theta_r, v_r, w_r = reference.tolist()
     error = tracking_error(x_r, y_r, theta_r, *held.tolist())
-    command = control_law(*error, v_r, w_r, by.kx, by.ky, by.ktheta)
+    command = kanayama(*error, v_r, w_r, by.kx, by.ky, by.ktheta)
     x, y, theta = pose.tolist()
     return np.array(euler_step(x, y, theta, *command, TS))
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from agv_cloud.control.kanayama import control_law, limit_speed
+from agv_cloud.control.command import limit_speed
+from agv_cloud.control.kanayama import kanayama
 from agv_cloud.tracking_error import tracking_error
 
 error = st.floats(-10.0, 10.0)
@@ -28,7 +29,7 @@ def test_the_matrix_form_of_the_paper(
     feed_forward = np.array([v_r * np.cos(theta_e), w_r])
     K = np.array([[kx, 0.0, 0.0], [0.0, v_r * ky, v_r * ktheta]])
     expected = feed_forward + K @ np.array([x_e, y_e, np.sin(theta_e)])
-    found = control_law(x_e, y_e, theta_e, v_r, w_r, kx, ky, ktheta)
+    found = kanayama(x_e, y_e, theta_e, v_r, w_r, kx, ky, ktheta)
     assert found == pytest.approx(tuple(expected), rel=1e-13, abs=1e-11)
 
 
@@ -37,20 +38,20 @@ def test_the_matrix_form_of_the_paper(
 def test_on_the_track_the_reference_s_speeds_are_passed_on_to_the_last_bit(
     v_r: float, w_r: float, kx: float, ky: float, ktheta: float
 ) -> None:
-    assert control_law(0.0, 0.0, 0.0, v_r, w_r, kx, ky, ktheta) == (v_r, w_r)
+    assert kanayama(0.0, 0.0, 0.0, v_r, w_r, kx, ky, ktheta) == (v_r, w_r)
 
 
 def test_the_start_of_the_paper_s_scenario() -> None:
     # v_r(0) = 0.5 m/s and the AGV 5 m ahead: v(0) = 0.5 - 5 K_x.
-    assert control_law(-5.0, 0.0, 0.0, 0.5, 0.0, 5.0, 1.0, 2.0) == (-24.5, 0.0)
-    assert limit_speed(control_law(-5.0, 0.0, 0.0, 0.5, 0.0, 5.0, 1.0, 2.0)[0], 6.0) == -6.0
+    assert kanayama(-5.0, 0.0, 0.0, 0.5, 0.0, 5.0, 1.0, 2.0) == (-24.5, 0.0)
+    assert limit_speed(kanayama(-5.0, 0.0, 0.0, 0.5, 0.0, 5.0, 1.0, 2.0)[0], 6.0) == -6.0
 
 
 @pytest.mark.parametrize(("which", "sign"), [(0, (1, 0)), (1, (0, 1)), (2, (0, 1))])
 def test_each_error_is_steered_against(which: int, sign: tuple[int, int]) -> None:
     """Reference ahead: faster. Reference to the left or turned to the left: turn left."""
     eps = 0.1 * np.eye(3)[which]
-    v, w = control_law(eps[0], eps[1], eps[2], 1.0, 0.0, 25.0, 1.0, 2.0)
+    v, w = kanayama(eps[0], eps[1], eps[2], 1.0, 0.0, 25.0, 1.0, 2.0)
     assert (np.sign(round(v - 1.0, 1)), np.sign(w)) == sign
 
 
@@ -60,7 +61,7 @@ def test_the_linearised_error_dynamics_of_kanayama(v_r: float, w_r: float, kx: f
     # Equation 400 with the law put in, at eps = 0; Kanayama et al. 1990, eq. 14, is its Jacobian.
     def derivative(eps: NDArray[np.float64]) -> NDArray[np.float64]:
         x_e, y_e, theta_e = eps
-        v, w = control_law(x_e, y_e, theta_e, v_r, w_r, kx, ky, ktheta)
+        v, w = kanayama(x_e, y_e, theta_e, v_r, w_r, kx, ky, ktheta)
         return np.array([w * y_e - v + v_r * np.cos(theta_e), -w * x_e + v_r * np.sin(theta_e), w_r - w])
 
     A = np.array([[-kx, w_r, 0.0], [-w_r, 0.0, v_r], [0.0, -v_r * ky, -v_r * ktheta]])
@@ -73,7 +74,7 @@ def test_the_linearised_error_dynamics_of_kanayama(v_r: float, w_r: float, kx: f
 def test_kanayama_s_lyapunov_function_falls(x_e: float, y_e: float, theta_e: float, v_r: float) -> None:
     # V = (x_e^2 + y_e^2)/2 + (1 - cos theta_e)/K_y has dV/dt = -K_x x_e^2 - v_r K_theta sin^2(theta_e)/K_y <= 0.
     kx, ky, ktheta = 10.0, 1.5, 2.0
-    v, w = control_law(x_e, y_e, theta_e, v_r, 0.3, kx, ky, ktheta)
+    v, w = kanayama(x_e, y_e, theta_e, v_r, 0.3, kx, ky, ktheta)
     rates = (w * y_e - v + v_r * math.cos(theta_e), -w * x_e + v_r * math.sin(theta_e), 0.3 - w)
     fall = x_e * rates[0] + y_e * rates[1] + math.sin(theta_e) / ky * rates[2]
     assert fall == pytest.approx(-kx * x_e**2 - v_r * ktheta * math.sin(theta_e) ** 2 / ky, rel=1e-9, abs=1e-9)
@@ -85,7 +86,7 @@ def test_with_the_tracking_error_the_agv_drives_towards_the_reference() -> None:
         for bearing in np.linspace(-math.pi, math.pi, 8):
             target = (math.cos(bearing), math.sin(bearing))
             eps = tracking_error(*target, heading, 0.0, 0.0, heading)
-            v, _ = control_law(*eps, 0.0, 0.0, 25.0, 1.0, 2.0)
+            v, _ = kanayama(*eps, 0.0, 0.0, 25.0, 1.0, 2.0)
             moved = (0.005 * v * math.cos(heading), 0.005 * v * math.sin(heading))
             assert math.dist(moved, target) <= math.dist((0.0, 0.0), target) + 1e-15
 

@@ -12,31 +12,43 @@ from hypothesis import strategies as st
 
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
-from agv_cloud.staleness import Prediction
-from agv_plant.vehicle.unicycle import STEPS, euler_step
+from agv_cloud.reference.point import ReferencePoint
+from agv_cloud.staleness.estimate import PoseEstimator
+from agv_cloud.staleness.registry import PREDICT, STALENESS_POLICIES
+from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.pose import Pose
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
 
 speeds = st.floats(-5.0, 5.0)
+
+
+def predictor(model: str, ts: float) -> PoseEstimator:
+    return PoseEstimator(STALENESS_POLICIES.find("predict"), PREDICT, (), ts, model == "arc")
+
+
+def standing(_: int) -> ReferencePoint:
+    return ReferencePoint(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 commands = st.lists(st.tuples(speeds, speeds), min_size=1, max_size=40)
 
 
 @given(commands, st.data(), st.sampled_from(sorted(STEPS)))
 def test_a_prediction_is_where_the_plant_is(sent: list[tuple[float, float]], data: st.DataObject, model: str) -> None:
     """Whenever poses come and however old they are, to the last bit."""
-    true, prediction, taken = [Pose(1.0, 2.0, 0.3)], Prediction(STEPS[model], 0.01), 0
+    true, prediction, taken = [Pose(1.0, 2.0, 0.3)], predictor(model, 0.01), 0
     for k, (v, w) in enumerate(sent):
         taken = data.draw(st.integers(taken, k))
-        assert prediction.at(k, taken, true[taken]) == true[k]
+        assert prediction.at(k, taken, true[taken], standing).held == true[k]
         prediction.add_command(k, v, w)
         true.append(Pose(*STEPS[model](*true[k], v, w, 0.01)))
 
 
 def test_a_step_without_command_goes_on_with_the_one_before() -> None:
-    prediction = Prediction(euler_step, 0.5)
+    prediction = predictor("euler", 0.5)
     prediction.add_command(0, 2.0, 0.0)
-    assert prediction.at(3, 0, Pose(0.0, 0.0, 0.0)) == (3.0, 0.0, 0.0)
+    assert prediction.at(3, 0, Pose(0.0, 0.0, 0.0), standing).held == (3.0, 0.0, 0.0)
     assert prediction.has_command(0)
     assert not prediction.has_command(3)
 

@@ -18,7 +18,7 @@ from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.simulation.noise import normals
 from agv_plant.parameters import PlantParameters
 from agv_plant.random_stream import normals_of
-from agv_plant.vehicle.motion import NOISE, SLIP, Body, Motion, body_of, move
+from agv_plant.vehicle.motion import NOISE, SLIP, Motion, VehicleParameters, move, vehicle_parameters
 from agv_plant.vehicle.slip import over_ground, side_slip
 from agv_plant.vehicle.unicycle import STEPS
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from test.conftest import Drive
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
-PLAIN = body_of(PlantParameters())
+PLAIN = vehicle_parameters(PlantParameters())
 
 number = st.floats(-1e3, 1e3)
 
 
-def driven(body: Body, v: float, w: float, steps: int) -> Motion:
+def driven(body: VehicleParameters, v: float, w: float, steps: int) -> Motion:
     """The motion after some periods under one command, from rest at the origin."""
     motion = Motion(0.0, 0.0, 0.0)
     for _ in range(steps):
@@ -64,7 +64,7 @@ def test_a_period_in_parts_is_as_many_short_periods(v: float, w: float, parts: i
     (PLAIN._replace(a_max=4.0), 2.0 * (1.0 - 0.5 * 0.5)),  # v (t - v / 2 a)
     (PLAIN._replace(j_max=32.0), 2.0 * (1.0 - 0.5 * 0.5)),  # v (t - T / 2), T = 2 sqrt(v / j)
 ], ids=["lag", "acceleration", "jerk"])  # fmt: skip
-def test_with_more_parts_the_way_is_that_of_the_continuous_drive(body: Body, way: float) -> None:
+def test_with_more_parts_the_way_is_that_of_the_continuous_drive(body: VehicleParameters, way: float) -> None:
     missing = [driven(body._replace(ts=0.1, substeps=parts), 2.0, 0.0, 10).x - way for parts in (1, 8, 64, 512)]
     assert abs(missing[-1]) < 1e-3
     assert missing[1] / missing[2] == pytest.approx(8.0, rel=0.1)  # first order

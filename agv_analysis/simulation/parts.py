@@ -1,0 +1,55 @@
+"""Which functions of the loop a scenario's parts take the place of."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.link_loop import recall_memory, store_memory
+from agv_cloud.control.command import control_law
+from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
+from agv_cloud.staleness.estimate import staleness_policy
+from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_plant.vehicle.motion import vehicle_step
+from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
+from agv_ros.substitution import Function, Replacements
+
+
+def replacements_of(scenario: Scenario) -> Replacements:
+    """The scenario's control law, staleness policy and vehicle, by the placeholders that the loop calls.
+
+    Those that the placeholders are themselves are left out, so that loops of the same parts are compiled once.
+    """
+    return _replacements(scenario.controller.law, scenario.error_detector.policy, scenario.plant.vehicle)
+
+
+@functools.cache
+def _replacements(law: str, policy: str, vehicle: str) -> Replacements:
+    found: dict[Function, Function] = {}
+    if law != KANAYAMA:
+        chosen = CONTROL_LAWS.find(law)
+        found[control_law] = chosen.adapter
+        if chosen.memory:
+            found[recall_memory], found[store_memory] = memory_functions(len(chosen.memory))
+    if policy not in STALENESS_POLICIES.own:
+        found[staleness_policy] = STALENESS_POLICIES.find(policy).adapter
+    if vehicle != UNICYCLE:
+        found[vehicle_step] = VEHICLES.find(vehicle).adapter
+    return found
+
+
+@functools.cache
+def memory_functions(size: int) -> tuple[Function, Function]:
+    """`recall_memory` and `store_memory` for a memory of `size` numbers.
+
+    Written out number by number, for a compiler must know the length of a tuple.
+    """
+    recalled = "".join(f"row[{i}], " for i in range(size))
+    stored = "".join(f"    row[{i}] = memory[{i}]\n" for i in range(size))
+    text = f"def recall(row):\n    return ({recalled})\n\n\ndef store(row, memory):\n{stored}"
+    known: dict[str, Any] = {}
+    exec(compile(text, f"<memory of {size} numbers>", "exec"), known)
+    recall, store = known["recall"], known["store"]
+    recall.__doc__ = store.__doc__ = text
+    return recall, store
