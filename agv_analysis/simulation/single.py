@@ -132,15 +132,16 @@ def steps_of(scenario: Scenario) -> int:
     return max(1, round(plant.duration / plant.ts))
 
 
+def obeys_at_once(plant: PlantParameters) -> bool:
+    """Is the AGV a unicycle that does in each step just what it is told, as the paper's does?"""
+    vehicle = vehicle_parameters(plant)
+    usual = vehicle._replace(arc=_PAPERS_VEHICLE.arc, ts=_PAPERS_VEHICLE.ts)
+    return plant.vehicle == UNICYCLE and usual == _PAPERS_VEHICLE
+
+
 def settings_of(scenario: Scenario) -> Settings:
     """What a slot of the loop needs to know of a scenario."""
     controller, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
-    vehicle = vehicle_parameters(plant)
-    is_paper = (
-        plant.vehicle == UNICYCLE
-        and plant.downlink_policy == "hold"
-        and vehicle._replace(arc=_PAPERS_VEHICLE.arc, ts=_PAPERS_VEHICLE.ts) == _PAPERS_VEHICLE
-    )
     policy = STALENESS_POLICIES.names().index(edge.policy)
     return Settings(
         gains=controller.gains, v_max=controller.v_max, ts=plant.ts,
@@ -151,7 +152,7 @@ def settings_of(scenario: Scenario) -> Settings:
         downlink_policy=DOWNLINK_POLICIES.index(plant.downlink_policy),
         policy_steps=plant.policy_steps,
         plan_arc=controller.integration == "arc" if plant.downlink_policy == "buffer" else None,
-        vehicle=None if is_paper else vehicle,
+        vehicle=None if obeys_at_once(plant) and plant.downlink_policy == "hold" else vehicle_parameters(plant),
         noise_xy=plant.noise_xy, noise_theta=plant.noise_theta,
     )  # fmt: skip
 

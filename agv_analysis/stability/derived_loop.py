@@ -9,7 +9,6 @@ of the reference's speeds over the outage.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.single import obeys_at_once
 from agv_analysis.stability.derivatives import jacobian
 from agv_analysis.stability.error_dynamics import (
     ERRORS,
@@ -50,6 +50,11 @@ def linear_loop(scenario: Scenario, v_r: Floats, w_r: Floats) -> LinearLoop:
         return kanayama_loop(
             v_r, w_r, scenario.controller, scenario.plant.ts, predicts=scenario.error_detector.policy == "predict"
         )
+    return derived_loop(scenario, v_r, w_r)
+
+
+def derived_loop(scenario: Scenario, v_r: Floats, w_r: Floats) -> LinearLoop:
+    """As `linear_loop`, by derivatives even where a closed form is known."""
     constant = np.ptp(v_r) == 0.0 and np.ptp(w_r) == 0.0
     v, w = (v_r[:1], w_r[:1]) if constant else (v_r, w_r)
     model = model_of(scenario)
@@ -66,18 +71,12 @@ def is_canonical(scenario: Scenario, v_r: Floats) -> bool:
     plant, edge = scenario.plant, scenario.error_detector
     return (
         scenario.controller.law == KANAYAMA
-        and model_of(scenario).settings.vehicle in (None, _exact_vehicle(scenario))
+        and obeys_at_once(plant)
         and plant.integration == "euler"
         and scenario.controller.steps_ahead == 0
         and (edge.policy in ("hold", "align") or (edge.policy == "predict" and edge.integration == "euler"))
         and float(np.abs(v_r).max()) < scenario.controller.v_max
     )
-
-
-def _exact_vehicle(scenario: Scenario) -> object:
-    """The vehicle's parameters, if it is a unicycle that obeys at once and is known by others for its downlink alone."""
-    found = model_of(dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, downlink_policy="hold")))
-    return None if found.settings.vehicle is not None else model_of(scenario).settings.vehicle
 
 
 def _assembled(

@@ -5,9 +5,9 @@ own frame, by the functions that the nodes call. Its state z is the tracking err
 acceleration), further states of the vehicle, and the memory of the control law. A law that looks ahead has the error to
 the reference of later, so for it the whole reference is that of later.
 
-The nominal motion is the one that the loop without losses repeats lap after lap; at constant speeds it is a fixed point.
-With an exact drive it is zero error; with a wrong speed, a lag, a limit or slip it is another one. It is found by
-Newton's method on the map of a lap, whose derivative is the product of the steps' derivatives.
+The nominal motion is the one that the loop without losses repeats lap after lap, at constant speeds a fixed point. With
+an exact drive it is zero error; with a wrong speed, a lag, a limit or slip it is another one. It is found by Newton's
+method on the map of a lap, whose derivative is the product of the steps' derivatives.
 """
 
 from __future__ import annotations
@@ -40,9 +40,12 @@ from agv_ros.substitution import Function, Replacements, replaced
 ERRORS, DRIVE = 3, 3
 """Numbers of the state: x_e, y_e, theta_e; v, w, a of the drive. Those of vehicle and law follow."""
 
-_ITERATIONS = 25
-_SETTLING_LAPS = 3
-"""Laps that are driven before Newton's method begins, where speeds change: the drive has settled by then."""
+_ITERATIONS = 15
+_CLOSED = 1e-11
+"""Up to this a lap ends where it began [m, rad, m/s]."""
+
+_SETTLING_LAPS, _SETTLING_STEPS = 3, 4000
+"""Laps, and steps, at least that are driven where Newton's method does not arrive from zero error."""
 
 
 class NoNominalMotionError(UserError):
@@ -70,7 +73,7 @@ def plant_error_step(
     x_e: float, y_e: float, theta_e: float, v_driven: float, w_driven: float, a_driven: float, states: Numbers,
     v: float, w: float, v_r: float, w_r: float, settings: Settings,
 ) -> tuple[float, float, float, float, float, float, Numbers]:  # fmt: skip
-    """The state but for the law's memory after a period under the command (v, w), the reference moving at (v_r, w_r)."""
+    """The state without the law's memory, a period later under the command (v, w), with the reference's speeds."""
     moved = period(
         Motion(0.0, 0.0, 0.0, v_driven, w_driven, a_driven, states), v, w, 0, 0.0, 0.0, settings.vehicle, settings
     )
@@ -231,25 +234,51 @@ def nominal_motion(model: LoopModel, v_r: Floats, w_r: Floats) -> Floats:
 
     One row may stand for a loop whose speeds never change. Raises NoNominalMotionError if there is no such lap.
     """
-    row, rows = model.start(v_r, w_r), np.empty(0)
-    for iteration in range(_ITERATIONS):
+    start = model.start(v_r, w_r)
+    found = _newton(model, start, v_r, w_r)
+    if found is not None and np.array_equal(found[0], start):
+        return found
+    laps = max(_SETTLING_LAPS, math.ceil(_SETTLING_STEPS / len(v_r)))
+    settled = model.drive(start, np.tile(v_r, laps), np.tile(w_r, laps))[-1]
+    if found is None and np.isfinite(settled).all():  # from where the loop goes by itself
+        found = _newton(model, settled, v_r, w_r)
+    if found is None or not _is_reached(model, found, start, settled, laps, v_r, w_r):
+        raise NoNominalMotionError(_what_it_does_instead(model, v_r, w_r))
+    return found
+
+
+def _is_reached(
+    model: LoopModel, found: Floats, start: Floats, settled: Floats, laps: int, v_r: Floats, w_r: Floats
+) -> bool:
+    """Does the loop, begun at zero error, come nearer to a lap that repeats itself, or is this unstable anyway?
+
+    Newton's method may also find a stable lap to which the loop never comes: far behind the reference, say, where a
+    limit holds all the time.
+    """
+    lap = _lap_matrix(model.closed_loop(model.derivatives(found, v_r, w_r)))
+    if not np.isfinite(lap).all() or np.abs(np.linalg.eigvals(lap)).max() >= 1.0 + 1e-6:
+        return True
+    before, after = (float(np.abs(row[:ERRORS] - found[0, :ERRORS]).max()) for row in (start, settled))
+    return after <= max(0.99 * before, 1e-6)
+
+
+def _newton(model: LoopModel, row: Floats, v_r: Floats, w_r: Floats) -> Floats | None:
+    """Newton's method on the map of a lap, from the state `row`; None where it does not arrive."""
+    weights = np.ones(model.size)
+    weights[ERRORS + 2] = model.settings.ts  # an acceleration is a difference over T_s, and so is its rounding
+    for _ in range(_ITERATIONS):
         rows = model.drive(row, v_r, w_r)
         missing = rows[-1] - row
         if not np.isfinite(missing).all():
-            break
-        weights = np.ones(model.size)
-        weights[ERRORS + 2] = model.settings.ts  # an acceleration is a difference over T_s, and so is its rounding
-        if np.abs(weights * missing).max() <= 1e-11 * max(1.0, float(np.abs(row).max())):
+            return None
+        if np.abs(weights * missing).max() <= _CLOSED * max(1.0, float(np.abs(row).max())):
             return rows[:-1]
-        if iteration < _SETTLING_LAPS and len(v_r) > 1:
-            row = rows[-1]
-            continue
         lap = _lap_matrix(model.closed_loop(model.derivatives(rows[:-1], v_r, w_r)))
         if not np.isfinite(lap).all():
-            break
+            return None
         step, *_ = np.linalg.lstsq(np.eye(model.size) - lap, missing, rcond=1e-12)
         row = row + step
-    raise NoNominalMotionError(_what_it_does_instead(model, v_r, w_r))
+    return None
 
 
 def _lap_matrix(steps: Floats) -> Floats:
