@@ -45,13 +45,13 @@ class Run:
     n_ul: NDArray[np.int64]
     """Steps since the freshest pose that the edge holds, shape (N,)."""
     lost: NDArray[np.bool_]
-    """Verdict of the uplink on slot k, shape (N,)."""
+    """Outcome of the uplink on slot k, shape (N,)."""
     downlink_lost: NDArray[np.bool_]
-    """Verdict of the downlink on slot k, shape (N,)."""
+    """Outcome of the downlink on slot k, shape (N,)."""
     n_dl: NDArray[np.int64] | None = None
     """Steps since the freshest command that the AGV holds was sent, shape (N,); None if nobody has written it down."""
     uplink: LinkSlots | None = None
-    """What is known of the uplink's slots beside their verdicts; None if nothing is."""
+    """What is known of the uplink's slots beside their outcomes; None if nothing is."""
     downlink: LinkSlots | None = None
     source: str = "simulation"
     """Where the run comes from: the path of its bag, or `simulation`."""

@@ -55,7 +55,7 @@ from agv_ros.stamps import MAX_FIRST, NS_PER_S, Grid, Steps
 from agv_ros.transforms import TransformBroadcaster
 
 TIMER = "timer"
-"""What edge/age says of its slots, in place of a verdict."""
+"""What edge/age says of its slots, in place of an outcome."""
 
 _PATH_TOPIC = "edge/path"
 

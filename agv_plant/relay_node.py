@@ -15,7 +15,8 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.parameters import RelayParameters
-from agv_plant.radio.link import Channel, Link, Passage
+from agv_plant.radio.channel import Channel
+from agv_plant.radio.link import Link, Passage
 from agv_ros.codec import decode_command, decode_odometry, decode_pose, encode_slot, encode_twist, stamp_of
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST
@@ -110,10 +111,10 @@ def _place_in(pose: bytes, is_odometry: bool, last: tuple[float, float]) -> tupl
         return last
 
 
-def _pass_on(passage: Passage, forward: Output, verdict: Output) -> None:
+def _pass_on(passage: Passage, forward: Output, outcome: Output) -> None:
     for data in passage.arrived:
         forward.publish(data)
-    verdict.publish(encode_slot(passage.slot))
+    outcome.publish(encode_slot(passage.slot))
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -202,11 +202,11 @@ def decode_odometry(data: bytes) -> StampedPose:
 
 
 def encode_slot(slot: Slot) -> bytes:
-    """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = verdict.
+    """sensor_msgs/TimeReference: header.stamp = t_k, time_ref = freshest stamp held, source = outcome.
 
     The note goes into header.frame_id, which this type has no other use for.
     """
-    source, note = slot.verdict.encode() + b"\0", slot.note.encode() + b"\0"
+    source, note = slot.outcome.encode() + b"\0", slot.note.encode() + b"\0"
     layout = _layout("<", "iI", (len(note),), f"iII{len(source)}s", 4)
     return padded(
         _LITTLE + layout.pack(*_split(slot.stamp_ns), len(note), note, *_split(slot.freshest_ns), len(source), source)

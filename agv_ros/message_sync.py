@@ -1,8 +1,8 @@
-"""Pairing a slot's verdict with the message that it speaks of.
+"""Pairing a slot's outcome with the message that it speaks of.
 
-Theory of operation. The relay sends two messages for a slot: the forwarded one, if it was delivered, and the verdict,
-always. They travel on two topics, so either may come first. The verdict names the stamp of the freshest message that
-the receiver holds behind the channel; the receiver acts on the verdict once it holds exactly that message. Thus what a
+Theory of operation. The relay sends two messages for a slot: the forwarded one, if it was delivered, and the outcome,
+always. They travel on two topics, so either may come first. The outcome names the stamp of the freshest message that
+the receiver holds behind the channel; the receiver acts on the outcome once it holds exactly that message. Thus what a
 node computes depends on stamps alone, never on the order of arrival. The error detector joins poses with uplink slots,
 the plant in lockstep commands with downlink slots: this join is the barrier that makes the loop deterministic.
 

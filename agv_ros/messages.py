@@ -57,13 +57,13 @@ class TrackingError(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """sensor_msgs/TimeReference: the channel's verdict on one slot and the freshest stamp held behind it (0: none)."""
+    """sensor_msgs/TimeReference: the channel's outcome on one slot and the freshest stamp held behind it (0: none)."""
 
     stamp_ns: int
     freshest_ns: int
-    verdict: str
+    outcome: str
     note: str = ""
-    """More of the verdict, as in `cause=rayleigh run=3 gain=-23.81`: words `name=value` with a blank between them."""
+    """More of the outcome, as in `cause=rayleigh run=3 gain=-23.81`: words `name=value` with a blank between them."""
 
 
 def facts_in(note: str) -> dict[str, str]:

@@ -26,7 +26,7 @@ from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.loop import RunInputs, at_rest, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.reference.reference import Reference
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 from benchmarks.comparison import Comparison
 
 CONFIG = str(Path(__file__).parent.parent / "config" / "paper.yaml")

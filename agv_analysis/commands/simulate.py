@@ -59,7 +59,7 @@ COLUMNS = (
     "k", "t", "x_c", "y_c", "theta_c", "x_r", "y_r", "theta_r", "v_r", "w_r", "x_e", "y_e", "theta_e", "v", "w", "n_ul",
     "lost", "downlink_lost", "n_dl", "cause", "gain", "downlink_cause", "downlink_gain",
 )  # fmt: skip
-"""Columns of the CSV file: [s], [m], [rad], [m/s], [rad/s]; x_e .. theta_e as the edge computed them; verdicts 0, 1.
+"""Columns of the CSV file: [s], [m], [rad], [m/s], [rad/s]; x_e .. theta_e as the edge computed them; outcomes 0, 1.
 
 Causes are those of losses, gains those of the channel [dB], nan where it has none.
 """

@@ -1,7 +1,7 @@
-"""A channel model fitted to recorded verdicts: independent losses or bursts, by maximum likelihood, and which of them.
+"""A channel model fitted to recorded outcomes: independent losses or bursts, by maximum likelihood, and which of them.
 
-A series of verdicts l(1) .. l(N) is a two-state Markov chain with p = P(lost after delivered) and r = P(delivered after
-lost): the Gilbert channel, netem's gemodel with h = 0, k = 1. Given the first verdict its maximum-likelihood estimates
+A series of outcomes l(1) .. l(N) is a two-state Markov chain with p = P(lost after delivered) and r = P(delivered after
+lost): the Gilbert channel, netem's gemodel with h = 0, k = 1. Given the first outcome its maximum-likelihood estimates
 are shares of transitions. Independent losses are the case p + r = 1 within it, so twice the difference of the log
 likelihoods is compared with the chi-square distribution of one degree of freedom.
 
@@ -20,7 +20,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.metrics.confidence import clopper_pearson
 
 SIGNIFICANCE = 0.01
-"""Independent losses are given up where verdicts as bursty as these would be rarer than this under them."""
+"""Independent losses are given up where outcomes as bursty as these would be rarer than this under them."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """Both models as fitted, and which of them the verdicts speak for."""
+    """Both models as fitted, and which of them the outcomes speak for."""
 
     loss_rate: Estimate
     """p of independent losses; its interval holds for these alone, bursts make the true one wider."""
@@ -48,11 +48,11 @@ class ChannelFit:
     r: Estimate | None
     """Delivered after lost; None if nothing was lost."""
     p_value: float | None
-    """Probability of verdicts this bursty (or this regular) if losses were independent; None without both verdicts."""
+    """Probability of outcomes this bursty (or this regular) if losses were independent; None without both outcomes."""
 
     @property
     def model(self) -> str:
-        """The simplest model that the verdicts do not speak against: perfect, bernoulli or gilbert_elliott."""
+        """The simplest model that the outcomes do not speak against: perfect, bernoulli or gilbert_elliott."""
         if self.loss_rate.value == 0.0:
             return "perfect"
         return "gilbert_elliott" if self.p_value is not None and self.p_value < SIGNIFICANCE else "bernoulli"
@@ -71,7 +71,7 @@ class ChannelFit:
 
 
 def fit_channel(lost: NDArray[np.bool_]) -> ChannelFit:
-    """Fit to verdicts, True where lost, shape (N,), N >= 1."""
+    """Fit to outcomes, True where lost, shape (N,), N >= 1."""
     before, after = lost[:-1], lost[1:]
     to_lost = int(np.count_nonzero(~before & after))
     to_delivered = int(np.count_nonzero(before & ~after))

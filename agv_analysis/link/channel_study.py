@@ -17,7 +17,7 @@ import numpy as np
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.link.markov_channel import Chain, chain_of
-from agv_analysis.metrics.outages import LinkOutages, Steps, Verdicts, ages, link_outages
+from agv_analysis.metrics.outages import LinkOutages, Outcomes, Steps, ages, link_outages
 from agv_analysis.run import Floats
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.link_loop import empty_trace, listen
@@ -46,8 +46,8 @@ class ChannelStudy:
     """Slots of a channel, and what they come to."""
 
     channel: ChannelParameters
-    lost: Verdicts
-    """Verdicts of the slots, True where lost, shape (N,)."""
+    lost: Outcomes
+    """Outcomes of the slots, True where lost, shape (N,)."""
     age: Steps
     """Slots since the last delivered one, shape (N,)."""
     outages: LinkOutages
@@ -55,8 +55,8 @@ class ChannelStudy:
     """The channel as a Markov chain; None if it is none."""
     late: float = 0.0
     """Share of the messages that are not lost and come in a later slot than their own."""
-    way: float = 0.0
-    """Length of the way that the AGV went [m]."""
+    distance: float = 0.0
+    """How far the AGV drove [m]."""
 
     @property
     def expected(self) -> Expected:
@@ -66,7 +66,7 @@ class ChannelStudy:
             age = self.chain.mean_age if not c.delays and math.isfinite(self.chain.mean_age) else None
             return Expected(self.chain.loss_rate, self.chain.mean_burst, age)
         if c.model == "rayleigh" and not c.schedule:
-            fades, rate = fades_per_metre(c.carrier, c.margin) * self.way, loss_rate(c.margin)
+            fades, rate = fades_per_metre(c.carrier, c.margin) * self.distance, loss_rate(c.margin)
             lasts = rate * len(self.lost) / fades if fades > 0.0 else 0.0
             return Expected(rate, lasts if lasts > _SHORTEST_FADE else None)
         return Expected()
@@ -117,17 +117,19 @@ def study(
     `places` are those of the AGV in frame `map` [m], shape (slots, 2); without them it stands at the origin. Raises
     TraceError for a trace that cannot be used or must not be outrun.
     """
-    air, k = ChannelRealisation(seed, slots, ts), np.arange(slots)
+    realisation, k = ChannelRealisation(seed, slots, ts), np.arange(slots)
     places = np.zeros((slots, 2)) if places is None else places
-    way = float(np.hypot(*np.diff(places, axis=0).T).sum())
+    distance = float(np.hypot(*np.diff(places, axis=0).T).sum())
     if channel.is_direct:
-        lost = air.verdicts(channel, link)
+        lost = realisation.outcomes(channel, link)
         age = ages(k, lost)
-        return ChannelStudy(channel, lost, age, link_outages(k, lost, age, ts), chain_of(channel), way=way)
-    marks, asked = empty_trace(slots), air.way(channel, link)
-    compiled(listen)(asked, marks, numbers(places))
-    age, late = k - marks.held, float(np.mean(np.asarray(asked.waits)[~marks.lost] > 0))
-    return ChannelStudy(channel, marks.lost, age, link_outages(k, marks.lost, age, ts), chain_of(channel), late, way)
+        return ChannelStudy(channel, lost, age, link_outages(k, lost, age, ts), chain_of(channel), distance=distance)
+    trace, inputs = empty_trace(slots), realisation.link_inputs(channel, link)
+    compiled(listen)(inputs, trace, numbers(places))
+    age, late = k - trace.held, float(np.mean(np.asarray(inputs.waits)[~trace.lost] > 0))
+    return ChannelStudy(
+        channel, trace.lost, age, link_outages(k, trace.lost, age, ts), chain_of(channel), late, distance
+    )
 
 
 def age_distribution(chain: Chain, count: int) -> Floats:
@@ -141,8 +143,8 @@ def age_distribution(chain: Chain, count: int) -> Floats:
     return -np.diff(np.array(beyond))
 
 
-def fitted(lost: Verdicts, channel: ChannelParameters) -> ChannelParameters:
-    """The model fitted to verdicts, as parameters of a channel; those that the fit does not know stay."""
+def fitted(lost: Outcomes, channel: ChannelParameters) -> ChannelParameters:
+    """The model fitted to outcomes, as parameters of a channel; those that the fit does not know stay."""
     fit = fit_channel(lost)
     if fit.model == "gilbert_elliott" and fit.p is not None and fit.r is not None:
         return replace(channel, model=fit.model, p=fit.p.value, r=fit.r.value, h=0.0, k=1.0)

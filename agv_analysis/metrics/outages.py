@@ -11,7 +11,7 @@ from agv_analysis.run import LinkSlots, Run
 from agv_ros.errors import UserError
 
 Steps = NDArray[np.int64]
-Verdicts = NDArray[np.bool_]
+Outcomes = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Outages:
 def outages(run: Run) -> Outages:
     """Outages of a run. Raises UserError if the run has no step.
 
-    The ages are those that the slots say; that of the downlink follows from its verdicts where it is not recorded.
+    The ages are those that the slots say; that of the downlink follows from its outcomes where it is not recorded.
     Where steps are missing from a recording an outage ends: nobody knows what became of those slots.
     """
     if not len(run):
@@ -109,8 +109,8 @@ def loss_causes(link: LinkSlots | None) -> dict[str, int]:
     return dict(zip(causes[order].tolist(), counts[order].tolist(), strict=True))
 
 
-def link_outages(k: Steps, lost: Verdicts, age: Steps, ts: float) -> LinkOutages:
-    """Outages of one link from its slots `k`, their verdicts and the age after each, shape (N,), N >= 1."""
+def link_outages(k: Steps, lost: Outcomes, age: Steps, ts: float) -> LinkOutages:
+    """Outages of one link from its slots `k`, their outcomes and the age after each, shape (N,), N >= 1."""
     lengths = outage_lengths(k, lost)
     values, counts = np.unique(lengths, return_counts=True)
     return LinkOutages(
@@ -128,19 +128,19 @@ def age_statistics(age: Steps, ts: float) -> Age:
     return Age(float(np.mean(age)), int(p50), int(p99), int(np.max(age)), ts)
 
 
-def outage_lengths(k: Steps, lost: Verdicts) -> Steps:
+def outage_lengths(k: Steps, lost: Outcomes) -> Steps:
     """Length of each series of consecutive lost slots, in the order of time; `k` and `lost` have shape (N,)."""
     begins = np.flatnonzero(lost & ~_follows_lost(k, lost))
     ends = np.flatnonzero(lost & ~_follows_lost(-k[::-1], lost[::-1])[::-1])
     return np.asarray(ends - begins + 1, dtype=np.int64)
 
 
-def _follows_lost(k: Steps, lost: Verdicts) -> Verdicts:
+def _follows_lost(k: Steps, lost: Outcomes) -> Outcomes:
     """Is the slot before each one known, and lost?"""
     return np.concatenate(([False], lost[:-1] & (np.diff(k) == 1)))
 
 
-def ages(k: Steps, lost: Verdicts) -> Steps:
+def ages(k: Steps, lost: Outcomes) -> Steps:
     """Steps since the last slot that was not lost, shape (N,); before the first such one, since the beginning."""
     received = np.where(lost, k[0] if len(k) else 0, k)
     return np.asarray(k - np.maximum.accumulate(received), dtype=np.int64)

@@ -168,7 +168,7 @@ def _difference(topic: str, run: Run, apart: Floats, recorded: Floats) -> Differ
 
 
 def write_outages(path: Path, run: Run, downlink: bool = False) -> int:
-    """Write the verdicts of one link to a CSV file for the channel `trace`; returns the number of slots lost.
+    """Write the outcomes of one link to a CSV file for the channel `trace`; returns the number of slots lost.
 
     Row 0 is the first slot recorded. Raises UserError if slots are missing, or for a path that cannot be written.
     """
@@ -191,7 +191,7 @@ def _write(path: Path, lost: NDArray[np.bool_]) -> None:
 
 
 def with_outages_of(run: Run, scenario: Scenario, folder: Path) -> Scenario:
-    """`scenario` in lockstep, for as long as the run and with the verdicts of both its links, in files in `folder`.
+    """`scenario` in lockstep, for as long as the run and with the outcomes of both its links, in files in `folder`.
 
     Raises UserError if the recording does not begin with step 0 or slots are missing.
     """

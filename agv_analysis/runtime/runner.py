@@ -25,7 +25,7 @@ from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
-from agv_plant.radio.link import check_length
+from agv_plant.radio.channel import check_length
 from agv_plant.relay_node import RelayNode
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals

@@ -41,7 +41,7 @@ STATISTICS = np.dtype([
 """
 
 Table = NDArray[np.void]
-Airs = Callable[[int, int, float], ChannelRealisation]
+Realisations = Callable[[int, int, float], ChannelRealisation]
 Job = tuple[int, int]
 """One run: (row, column) of the table, that is, scenario and seed."""
 
@@ -110,76 +110,75 @@ class _Batch:
 
     def work(self, unit: list[Job]) -> int:
         """Run one part; returns the number of its runs."""
-        airs = functools.lru_cache(maxsize=4)(ChannelRealisation)
+        realisations = functools.lru_cache(maxsize=4)(ChannelRealisation)
         run = self._with_twins if self._twins else self._by_twos
         for kind, jobs in groupby(sorted(unit, key=lambda job: self._kind[job[0]]), lambda job: self._kind[job[0]]):
             row = self._kind.index(kind)
             parts = replacements_of(self._scenarios[row])
-            for job, found, contraction in run(self._reference(row), list(jobs), airs, parts):
+            for job, found, contraction in run(self._reference(row), list(jobs), realisations, parts):
                 self.table[job] = (*found, contraction)
         return len(unit)
 
     def _by_twos(
-        self, reference: Floats, jobs: list[Job], airs: Airs, parts: Replacements
+        self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
     ) -> Iterator[tuple[Job, Statistics, float]]:
         direct = [job for job in jobs if self._is_direct(job)]
         for job in jobs:
             if not self._is_direct(job):
-                yield job, self._over_links(reference, job, airs, parts)[0], math.nan
+                yield job, self._over_links(reference, job, realisations, parts)[0], math.nan
         for one, other in zip_longest(direct[::2], direct[1::2]):
             if other is None:
-                yield one, run_parts(statistics, parts, reference, self._case(one, airs)), math.nan
+                yield one, run_parts(statistics, parts, reference, self._inputs(one, realisations)), math.nan
             else:
-                found = run_parts(statistics_of_two, parts, reference, self._case(one, airs), self._case(other, airs))
+                inputs = self._inputs(one, realisations), self._inputs(other, realisations)
+                found = run_parts(statistics_of_two, parts, reference, *inputs)
                 yield one, found[0], math.nan
                 yield other, found[1], math.nan
 
     def _with_twins(
-        self, reference: Floats, jobs: list[Job], airs: Airs, parts: Replacements
+        self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
     ) -> Iterator[tuple[Job, Statistics, float]]:
         for job in jobs:
             twin = start_of(self._scenarios[job[0]], TWIN_OFFSET)
             if self._is_direct(job):
-                yield job, *run_parts(statistics_of_twins, parts, reference, self._case(job, airs), twin)
+                yield job, *run_parts(statistics_of_twins, parts, reference, self._inputs(job, realisations), twin)
             else:
-                found, marks = self._over_links(reference, job, airs, parts)
+                found, traces = self._over_links(reference, job, realisations, parts)
                 is_whole = found.steps == self._steps[job[0]]
-                case = self._case(job, airs)
-                yield (
-                    job,
-                    found,
-                    run_parts(contraction_over_links, parts, reference, case, twin, *marks) if is_whole else math.inf,
-                )
+                inputs = self._inputs(job, realisations)
+                arguments = reference, inputs, twin, *traces
+                yield job, found, run_parts(contraction_over_links, parts, *arguments) if is_whole else math.inf
 
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay
         return relay.uplink.is_direct and relay.downlink.is_direct
 
     def _over_links(
-        self, reference: Floats, job: Job, airs: Airs, parts: Replacements
+        self, reference: Floats, job: Job, realisations: Realisations, parts: Replacements
     ) -> tuple[Statistics, tuple[LinkTrace, LinkTrace]]:
         """One run whose links have to be asked in the loop, and what became of its messages."""
-        air, relay, steps = self._air(job, airs), self._scenarios[job[0]].relay, self._steps[job[0]]
-        marks = empty_trace(steps), empty_trace(steps)
-        ways = air.way(relay.uplink, "uplink"), air.way(relay.downlink, "downlink")
-        return run_parts(statistics_over_links, parts, reference, self._case(job, airs), *ways, *marks), marks
+        realisation, inputs = self._realisation(job, realisations), self._inputs(job, realisations)
+        relay, steps = self._scenarios[job[0]].relay, self._steps[job[0]]
+        links = realisation.link_inputs(relay.uplink, "uplink"), realisation.link_inputs(relay.downlink, "downlink")
+        traces = empty_trace(steps), empty_trace(steps)
+        return run_parts(statistics_over_links, parts, reference, inputs, *links, *traces), traces
 
-    def _air(self, job: Job, airs: Airs) -> ChannelRealisation:
+    def _realisation(self, job: Job, realisations: Realisations) -> ChannelRealisation:
         row, column = job
-        return airs(self._seeds[column], self._steps[row], self._scenarios[row].plant.ts)
+        return realisations(self._seeds[column], self._steps[row], self._scenarios[row].plant.ts)
 
     def _reference(self, row: int) -> Floats:
         detector = self._scenarios[row].error_detector
         reference: Floats = numbers(reference_of(detector, self._steps[row] + detector.steps_ahead))
         return reference
 
-    def _case(self, job: Job, airs: Airs) -> RunInputs:
-        scenario, air = self._scenarios[job[0]], self._air(job, airs)
+    def _inputs(self, job: Job, realisations: Realisations) -> RunInputs:
+        scenario, realisation = self._scenarios[job[0]], self._realisation(job, realisations)
         return RunInputs(
-            numbers(air.verdicts(scenario.relay.uplink, "uplink")),
-            numbers(air.verdicts(scenario.relay.downlink, "downlink")),
+            numbers(realisation.outcomes(scenario.relay.uplink, "uplink")),
+            numbers(realisation.outcomes(scenario.relay.downlink, "downlink")),
             start_of(scenario),
             settings_of(scenario),
-            numbers(air.normals(NOISE)) if scenario.plant.is_noisy else None,
-            numbers(air.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,
+            numbers(realisation.normals(NOISE)) if scenario.plant.is_noisy else None,
+            numbers(realisation.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,
         )

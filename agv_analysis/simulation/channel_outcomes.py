@@ -1,4 +1,4 @@
-"""Verdicts of a channel on a whole run, compiled: those of `agv_plant.radio.link.Channel`, bit for bit.
+"""Outcomes of a channel on a whole run, compiled: those of `agv_plant.radio.channel.Channel`, bit for bit.
 
 The same models, the same random numbers; only the loop over the slots is another one, since that of the relay asks for
 one slot at a time.
@@ -22,15 +22,15 @@ from agv_plant.channels import GOOD, MODELS
 from agv_plant.channels.position_dependent import kind_of
 from agv_plant.channels.registry import SHARED, TRACE, find_model
 from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.channel import Channel, delay_draws, draws, losses, own_stream
 from agv_plant.radio.channel_setup import Segment, levels_of, segments_of, spatial_table_of
 from agv_plant.radio.delay import NEVER, delays_of, soonest
-from agv_plant.radio.link import Channel, delay_draws, draws, losses, own_stream
 from agv_plant.radio.schedule import is_scripted
 from agv_plant.radio.shared_uplink import SCHEDULERS, serve_all, stream_of
 from agv_plant.random_stream import uniforms
 from agv_ros.parameters import LoopParameters
 
-Verdicts = NDArray[np.bool_]
+Outcomes = NDArray[np.bool_]
 States = NDArray[np.int64]
 
 _NUMERIC = [field.name for field in dataclasses.fields(ChannelParameters) if not isinstance(field.default, str)]
@@ -38,40 +38,40 @@ _Numbers = namedtuple("_Numbers", _NUMERIC)  # type: ignore[misc]  # numba knows
 
 
 class ChannelRealisation:
-    """Channels under one seed; keeps the random numbers and the latest verdicts, which many runs share."""
+    """Channels under one seed; keeps the random numbers and the latest outcomes, which many runs share."""
 
     def __init__(self, seed: int, steps: int, ts: float = LoopParameters.ts) -> None:
         self._steps = steps
         self._seed = seed
         self._ts = ts
         self._shared = functools.cache(lambda stream: uniforms(seed, stream, 0, steps))
-        self._verdicts = functools.lru_cache(maxsize=128)(self._judge)
-        self._ways = functools.lru_cache(maxsize=8)(self._way)
+        self._outcomes = functools.lru_cache(maxsize=128)(self._compute)
+        self._link_inputs = functools.lru_cache(maxsize=8)(self._make_link_inputs)
         self.normals = functools.cache(lambda stream: normals(seed, stream, steps))
         """Normal numbers of a stream of the AGV's, shape (steps, DRAWS)."""
 
-    def verdicts(self, channel: ChannelParameters, stream: str) -> Verdicts:
-        """Verdicts of the slots 0 .. steps - 1, True where lost, shape (steps,); not to be written to.
+    def outcomes(self, channel: ChannelParameters, stream: str) -> Outcomes:
+        """Outcomes of the slots 0 .. steps - 1, True where lost, shape (steps,); not to be written to.
 
         Of a channel that asks for the place: what is lost wherever the AGV is.
         """
-        return self._verdicts(channel, stream)
+        return self._outcomes(channel, stream)
 
-    def fates(self, channel: ChannelParameters, stream: str) -> tuple[Verdicts, States]:
-        """Verdicts, and the state that decided each, of a channel with memory; shapes (steps,). Neither is kept."""
+    def outcomes_and_states(self, channel: ChannelParameters, stream: str) -> tuple[Outcomes, States]:
+        """Outcomes, and the state that decided each, of a channel with memory; shapes (steps,). Neither is kept."""
         states = np.full(self._steps, GOOD, dtype=np.int64)
-        return self._judge(channel, stream, states), states
+        return self._compute(channel, stream, states), states
 
-    def way(self, channel: ChannelParameters, stream: str) -> LinkInputs:
+    def link_inputs(self, channel: ChannelParameters, stream: str) -> LinkInputs:
         """All that a link needs to be asked slot by slot."""
-        return self._ways(channel, stream)
+        return self._link_inputs(channel, stream)
 
-    def _way(self, channel: ChannelParameters, stream: str) -> LinkInputs:
-        lost, random = self.verdicts(channel, stream), self._draws(channel, stream)
+    def _make_link_inputs(self, channel: ChannelParameters, stream: str) -> LinkInputs:
+        lost, random = self.outcomes(channel, stream), self._draws(channel, stream)
         return link_inputs(channel, self._seed, stream, lost, random, self._ts)
 
-    def _judge(self, channel: ChannelParameters, stream: str, states: States | None = None) -> Verdicts:
-        """Verdicts, and into `states` the states that decided."""
+    def _compute(self, channel: ChannelParameters, stream: str, states: States | None = None) -> Outcomes:
+        """Outcomes, and into `states` the states that decided."""
         states = np.empty(self._steps, dtype=np.int64) if states is None else states
         if channel.model == TRACE:  # nothing to compute
             return losses(channel, self._seed, stream, self._steps, self._ts)
@@ -94,7 +94,7 @@ class ChannelRealisation:
         lost[0] = False  # slot 0 never is
         return lost
 
-    def _serve(self, channel: ChannelParameters, stream: str, lost: Verdicts) -> None:
+    def _serve(self, channel: ChannelParameters, stream: str, lost: Outcomes) -> None:
         """Work out what becomes of the whole fleet."""
         streams = [stream_of(stream, vehicle) for vehicle in range(channel.vehicles)]
         drawn = np.stack([uniforms(self._seed, name, 0, self._steps) for name in streams], axis=2)
@@ -106,13 +106,13 @@ class ChannelRealisation:
             compiled(serve_all)(segment.first, channel.blocks, scheduler, p, u[:, 0], u[:, 1], ages, served)
         lost[:] = of_all[:, channel.vehicle]
 
-    def _ask(self, channel: ChannelParameters, stream: str, lost: Verdicts, states: States) -> None:
+    def _ask(self, channel: ChannelParameters, stream: str, lost: Outcomes, states: States) -> None:
         """Ask the channel's model, slot by slot."""
-        judge = compiled(judge_all, {model: find_model(channel.model)})
+        compute = compiled(outcomes_of_slots, {model: find_model(channel.model)})
         random, state = numbers(self._draws(channel, stream)), GOOD
         for segment, end in _segments(channel, self._steps, self._ts):
             parameters = _Numbers(*(getattr(segment.channel, name) for name in _NUMERIC))
-            state = judge(parameters, random, lost, states, segment.first, end, state)
+            state = compute(parameters, random, lost, states, segment.first, end, state)
 
     def _draws(self, channel: ChannelParameters, stream: str) -> NDArray[np.float64]:
         if channel.correlation == 0.0:
@@ -121,7 +121,7 @@ class ChannelRealisation:
 
 
 def link_inputs(
-    channel: ChannelParameters, seed: int, stream: str, lost: Verdicts, random: NDArray[np.float64], ts: float
+    channel: ChannelParameters, seed: int, stream: str, lost: Outcomes, random: NDArray[np.float64], ts: float
 ) -> LinkInputs:
     """A link from what is lost wherever the AGV is, shape (N,), and the channel's random numbers, shape (N, DRAWS)."""
     steps = len(lost)
@@ -156,27 +156,29 @@ def _segments(channel: ChannelParameters, steps: int, ts: float) -> list[tuple[S
     return list(zip(found, [*(segment.first for segment in found[1:]), steps], strict=True))
 
 
-def _one_by_one(channel: Channel, states: States) -> Verdicts:
+def _one_by_one(channel: Channel, states: States) -> Outcomes:
     lost = np.empty(len(states), dtype=np.bool_)
     for k in range(len(states)):
-        verdict = channel.judge(k)
-        lost[k], states[k] = verdict.lost, verdict.state
+        outcome = channel.outcome(k)
+        lost[k], states[k] = outcome.lost, outcome.state
     return lost
 
 
 model: Any = MODELS["perfect"]
-"""Of the channel that `judge_all` is made for; as it stands here, one that loses nothing."""
+"""Of the channel that `outcomes_of_slots` is made for; as it stands here, one that loses nothing."""
 
 
-def judge_all(channel: Any, random: Any, lost: Verdicts, states: States, first: int, end: int, state: int) -> int:
-    """Verdicts of the slots first .. end - 1, and the states before them; returns the one after them."""
+def outcomes_of_slots(
+    channel: Any, random: Any, lost: Outcomes, states: States, first: int, end: int, state: int
+) -> int:
+    """Outcomes of the slots first .. end - 1, and the states before them; returns the one after them."""
     for k in range(first, end):
         states[k] = state
         lost[k], state = model(channel, k, random[k], state)
     return state
 
 
-def _script(lost: Verdicts, first: int, end: int, at: float, length: float, period: float, ts: float) -> None:
+def _script(lost: Outcomes, first: int, end: int, at: float, length: float, period: float, ts: float) -> None:
     for k in range(first, end):
         lost[k] = lost[k] or is_scripted(k, at, length, period, ts)
 

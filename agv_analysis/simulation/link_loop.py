@@ -1,6 +1,6 @@
-"""Runs in which a verdict depends on the place, or messages are under way for longer than their slot.
+"""Runs in which an outcome depends on the place, or messages are under way for longer than their slot.
 
-`loop` takes the verdicts of a whole run as given, and a message that is not lost as here. Where that is not so, this is
+`loop` takes the outcomes of a whole run as given, and a message that is not lost as here. Where that is not so, this is
 the same loop, made of the same functions: in each slot both links are asked first, with the pose that the AGV sends,
 for the freshest message that their receivers now hold; what it said is looked up in the run so far.
 """
@@ -41,7 +41,7 @@ from agv_analysis.simulation.loop import (
     wheels,
 )
 from agv_cloud.staleness.estimate import staleness_policy
-from agv_plant.channels.position_dependent import EVERYWHERE, verdict_at
+from agv_plant.channels.position_dependent import EVERYWHERE, outcome_at
 from agv_ros.pose import Pose
 
 
@@ -75,34 +75,34 @@ class LinkTrace(NamedTuple):
 
 
 def empty_trace(steps: int) -> LinkTrace:
-    """Marks of a run that has not begun."""
+    """Traces of a run that has not begun."""
     return LinkTrace(
         np.zeros(steps, dtype=np.bool_), np.zeros(steps, dtype=np.int64), np.full(steps, math.nan),
         np.zeros(steps, dtype=np.int64),
     )  # fmt: skip
 
 
-def transmit(way: LinkInputs, marks: LinkTrace, k: int, x: float, y: float) -> int:
+def transmit(link: LinkInputs, trace: LinkTrace, k: int, x: float, y: float) -> int:
     """Slot k of a link, of an AGV that is at (x, y) [m]: step of the freshest message that the receiver holds then."""
-    lost, gain = way.lost[k], math.nan
-    if way.kind != EVERYWHERE:
-        is_bad, gain = verdict_at(
-            way.kind, way.spatial_table, way.levels[k][0], way.levels[k][1], way.random[k][0], x, y
+    lost, gain = link.lost[k], math.nan
+    if link.kind != EVERYWHERE:
+        is_bad, gain = outcome_at(
+            link.kind, link.spatial_table, link.levels[k][0], link.levels[k][1], link.random[k][0], x, y
         )
         lost = lost or (is_bad and k > 0)
-    arrival = k + way.waits[k]
-    if not lost and arrival < len(marks.due):
-        marks.due[arrival] = max(marks.due[arrival], k)
-    marks.lost[k], marks.gain[k] = lost, gain
-    held: int = max(marks.due[k], marks.held[k - 1] if k > 0 else 0)
-    marks.held[k] = held
+    arrival = k + link.waits[k]
+    if not lost and arrival < len(trace.due):
+        trace.due[arrival] = max(trace.due[arrival], k)
+    trace.lost[k], trace.gain[k] = lost, gain
+    held: int = max(trace.due[k], trace.held[k - 1] if k > 0 else 0)
+    trace.held[k] = held
     return held
 
 
-def listen(way: LinkInputs, marks: LinkTrace, places: Rows) -> None:
+def listen(link: LinkInputs, trace: LinkTrace, places: Rows) -> None:
     """A link alone, without a loop: its slots with the AGV at the `places` [m], shape (N, 2)."""
-    for k in range(len(marks.held)):
-        transmit(way, marks, k, places[k][0], places[k][1])
+    for k in range(len(trace.held)):
+        transmit(link, trace, k, places[k][0], places[k][1])
 
 
 # -- one slot ----------------------------------------------------------------------------------------------------------
@@ -129,20 +129,20 @@ def send_pose(past: Past, k: int, loop: Loop, noise: Rows | None, settings: Sett
 
 
 def slot_over_links(
-    loop: Loop, k: int, taken: int, ordered: int, reference: Rows, case: RunInputs, past: Past
+    loop: Loop, k: int, taken: int, ordered: int, reference: Rows, inputs: RunInputs, past: Past
 ) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, with the pose of step `taken` at the edge, the command of step `ordered` at the AGV.
 
     `past` is known up to the pose of step k; command and error of step k are written into it.
     """
-    settings = case.settings
+    settings = inputs.settings
     seen = seen_reference(reference_at(reference, k), reference, k, settings.ahead)
     edge = at_the_edge(loop.edge, k, taken, reference, past, settings)
     sent, memory = edge_step(edge, seen, settings)
     row = past.values[k]
     row[3], row[4], row[5], row[6], row[7] = sent.v, sent.w, sent.x_e, sent.y_e, sent.theta_e
     store_memory(past.memory[k], memory)
-    n_left, n_right = wheels(case.slip, k)
+    n_left, n_right = wheels(inputs.slip, k)
     held = Loop(loop.motion, edge, loop.command, loop.plan)
     if ordered == k:
         return plant_step(held, sent, memory, False, n_left, n_right, seen, settings), sent
@@ -207,21 +207,21 @@ def at_the_edge(edge: EdgeState, k: int, taken: int, reference: Rows, past: Past
 
 
 def history_over_links(
-    reference: Rows, case: RunInputs, up: LinkInputs, down: LinkInputs, up_marks: LinkTrace, down_marks: LinkTrace,
+    reference: Rows, inputs: RunInputs, up: LinkInputs, down: LinkInputs, up_trace: LinkTrace, down_trace: LinkTrace,
     rows: NDArray[np.float64],
 ) -> int:  # fmt: skip
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), and what became of its messages.
 
-    `reference` as of `loop.history`; the outcomes of `case` mean nothing. Returns the number of slots until the run
+    `reference` as of `loop.history`; the outcomes of `inputs` mean nothing. Returns the number of slots until the run
     ended.
     """
-    loop, past = case.start, nothing_past(len(rows), case.start.edge.memory)
+    loop, past = inputs.start, nothing_past(len(rows), inputs.start.edge.memory)
     for k in range(len(rows)):
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.motion.x, loop.motion.y, loop.motion.theta
-        send_pose(past, k, loop, case.noise, case.settings)
-        taken = transmit(up, up_marks, k, past.values[k, 0], past.values[k, 1])
-        ordered = transmit(down, down_marks, k, past.values[k, 0], past.values[k, 1])
-        loop, sent = slot_over_links(loop, k, taken, ordered, reference, case, past)
+        send_pose(past, k, loop, inputs.noise, inputs.settings)
+        taken = transmit(up, up_trace, k, past.values[k, 0], past.values[k, 1])
+        ordered = transmit(down, down_trace, k, past.values[k, 0], past.values[k, 1])
+        loop, sent = slot_over_links(loop, k, taken, ordered, reference, inputs, past)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
         if not goes_on(loop, sent):
@@ -230,35 +230,35 @@ def history_over_links(
 
 
 def statistics_over_links(
-    reference: Rows, case: RunInputs, up: LinkInputs, down: LinkInputs, up_marks: LinkTrace, down_marks: LinkTrace
+    reference: Rows, inputs: RunInputs, up: LinkInputs, down: LinkInputs, up_trace: LinkTrace, down_trace: LinkTrace
 ) -> Statistics:
-    """One run of which only the metrics are kept, and the marks."""
-    run, past = begin(reference, case), nothing_past(len(up_marks.held), case.start.edge.memory)
-    for k in range(len(up_marks.held)):
-        send_pose(past, k, run.loop, case.noise, case.settings)
-        taken = transmit(up, up_marks, k, past.values[k, 0], past.values[k, 1])
-        ordered = transmit(down, down_marks, k, past.values[k, 0], past.values[k, 1])
-        loop, sent = slot_over_links(run.loop, k, taken, ordered, reference, case, past)
+    """One run of which only the metrics are kept, and the traces of its links."""
+    run, past = begin(reference, inputs), nothing_past(len(up_trace.held), inputs.start.edge.memory)
+    for k in range(len(up_trace.held)):
+        send_pose(past, k, run.loop, inputs.noise, inputs.settings)
+        taken = transmit(up, up_trace, k, past.values[k, 0], past.values[k, 1])
+        ordered = transmit(down, down_trace, k, past.values[k, 0], past.values[k, 1])
+        loop, sent = slot_over_links(run.loop, k, taken, ordered, reference, inputs, past)
         run = update_metrics(run, k, reference_at(reference, k), loop, sent)
         if not run.goes_on:
             break
-    return end(run, reference[0][1] - case.start.motion.y, case.settings.ts)
+    return end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
 
 
 def contraction_over_links(
-    reference: Rows, case: RunInputs, twin: Loop, up_marks: LinkTrace, down_marks: LinkTrace
+    reference: Rows, inputs: RunInputs, twin: Loop, up_trace: LinkTrace, down_trace: LinkTrace
 ) -> float:
     """How far a run and its twin, begun elsewhere, are apart in the end, as in `loop.statistics_of_twins`.
 
-    Both meet what was marked when the run was made: the twin loses what the run lost, wherever it is.
+    Both meet what the traces of the run hold: the twin loses what the run lost, wherever it is.
     """
-    one, other, steps = case.start, twin, len(up_marks.held)
+    one, other, steps = inputs.start, twin, len(up_trace.held)
     past, past_of_twin = nothing_past(steps, one.edge.memory), nothing_past(steps, one.edge.memory)
     for k in range(steps):
-        send_pose(past, k, one, case.noise, case.settings)
-        send_pose(past_of_twin, k, other, case.noise, case.settings)
-        one, sent = slot_over_links(one, k, up_marks.held[k], down_marks.held[k], reference, case, past)
-        other, said = slot_over_links(other, k, up_marks.held[k], down_marks.held[k], reference, case, past_of_twin)
+        send_pose(past, k, one, inputs.noise, inputs.settings)
+        send_pose(past_of_twin, k, other, inputs.noise, inputs.settings)
+        one, sent = slot_over_links(one, k, up_trace.held[k], down_trace.held[k], reference, inputs, past)
+        other, said = slot_over_links(other, k, up_trace.held[k], down_trace.held[k], reference, inputs, past_of_twin)
         if not (goes_on(one, sent) and goes_on(other, said)):
             return math.inf
-    return apart(one.motion, other.motion) / apart(case.start.motion, twin.motion)
+    return apart(one.motion, other.motion) / apart(inputs.start.motion, twin.motion)

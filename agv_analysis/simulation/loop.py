@@ -148,21 +148,21 @@ def at_rest(x: float, y: float, theta: float, states: Numbers = (), memory: Numb
 # -- one slot ----------------------------------------------------------------------------------------------------------
 
 
-def slot(loop: Loop, reference: ReferencePoint, case: RunInputs, k: int) -> tuple[Loop, EdgeOutput]:
+def slot(loop: Loop, reference: ReferencePoint, inputs: RunInputs, k: int) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, under the outcomes of both links in slot k, with the reference as the edge sees it."""
-    n_left, n_right = wheels(case.slip, k)
-    if case.lost[k]:
-        edge = outdated(loop.edge, reference, case.settings)
-        sent, memory = edge_step(edge, reference, case.settings)
+    n_left, n_right = wheels(inputs.slip, k)
+    if inputs.lost[k]:
+        edge = outdated(loop.edge, reference, inputs.settings)
+        sent, memory = edge_step(edge, reference, inputs.settings)
         held = Loop(loop.motion, edge, loop.command, loop.plan)
         return plant_step(
-            held, sent, memory, case.downlink_lost[k], n_left, n_right, reference, case.settings
+            held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings
         ), sent  # fmt: skip
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
-    edge = received(loop.edge, sent_pose(loop.motion, case.noise, k, case.settings), reference)
-    sent, memory = edge_step(edge, reference, case.settings)
+    edge = received(loop.edge, sent_pose(loop.motion, inputs.noise, k, inputs.settings), reference)
+    sent, memory = edge_step(edge, reference, inputs.settings)
     held = Loop(loop.motion, edge, loop.command, loop.plan)
-    return plant_step(held, sent, memory, case.downlink_lost[k], n_left, n_right, reference, case.settings), sent
+    return plant_step(held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings), sent
 
 
 def reference_at(reference: Rows, k: int) -> ReferencePoint:
@@ -290,23 +290,23 @@ def are_finite(a: float, b: float, c: float) -> bool:
 # -- whole runs --------------------------------------------------------------------------------------------------------
 
 
-def history(reference: Rows, case: RunInputs, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
+def history(reference: Rows, inputs: RunInputs, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
     """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), its age into n_ul[k], shape (N,).
 
     `reference` has shape (N, 5), or as many rows more as the edge looks ahead. Returns the number of slots until the
     run ended, N at most.
     """
-    loop = case.start
-    for k in range(len(case.lost)):
+    loop = inputs.start
+    for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.motion.x, loop.motion.y, loop.motion.theta
-        loop, sent = slot(loop, seen_reference(now, reference, k, case.settings.ahead), case, k)
+        loop, sent = slot(loop, seen_reference(now, reference, k, inputs.settings.ahead), inputs, k)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
         n_ul[k] = loop.edge.n_ul
         if not goes_on(loop, sent):
             return k + 1
-    return len(case.lost)
+    return len(inputs.lost)
 
 
 class Statistics(NamedTuple):
@@ -353,17 +353,17 @@ class MetricsAccumulator(NamedTuple):
     n_ul_sum: int
 
 
-def begin(reference: Rows, case: RunInputs) -> MetricsAccumulator:
+def begin(reference: Rows, inputs: RunInputs) -> MetricsAccumulator:
     """A run before slot 0."""
-    band = SHARE * abs(reference[0][1] - case.start.motion.y)
-    return MetricsAccumulator(case.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
+    band = SHARE * abs(reference[0][1] - inputs.start.motion.y)
+    return MetricsAccumulator(inputs.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
 def proceed(
-    run: MetricsAccumulator, k: int, now: ReferencePoint, seen: ReferencePoint, case: RunInputs
+    run: MetricsAccumulator, k: int, now: ReferencePoint, seen: ReferencePoint, inputs: RunInputs
 ) -> MetricsAccumulator:
     """The run after slot k, at which the reference is at `now`, and the edge compares with `seen`."""
-    loop, sent = slot(run.loop, seen, case, k)
+    loop, sent = slot(run.loop, seen, inputs, k)
     return update_metrics(run, k, now, loop, sent)
 
 
@@ -412,15 +412,15 @@ def end(run: MetricsAccumulator, initial: float, ts: float) -> Statistics:
     )
 
 
-def statistics(reference: Rows, case: RunInputs) -> Statistics:
+def statistics(reference: Rows, inputs: RunInputs) -> Statistics:
     """One run of which only the metrics are kept; `reference` as of `history`."""
-    run = begin(reference, case)
-    for k in range(len(case.lost)):
+    run = begin(reference, inputs)
+    for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
-        run = proceed(run, k, now, seen_reference(now, reference, k, case.settings.ahead), case)
+        run = proceed(run, k, now, seen_reference(now, reference, k, inputs.settings.ahead), inputs)
         if not run.goes_on:
             break
-    return end(run, reference[0][1] - case.start.motion.y, case.settings.ts)
+    return end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
 
 
 def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[Statistics, Statistics]:
@@ -442,26 +442,26 @@ def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tupl
     )
 
 
-def statistics_of_twins(reference: Rows, case: RunInputs, twin: Loop) -> tuple[Statistics, float]:
+def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple[Statistics, float]:
     """A run as `statistics`, and how far a twin of it, begun elsewhere and with the same losses, is in the end.
 
     That is the distance of the two AGVs in (x, y, theta) [m, m, rad] as a multiple of what it was at the beginning: a
     loop that forgets where it began contracts it. inf if either leaves the range of numbers.
     """
-    run, begun, ends = begin(reference, case), twin, False
-    for k in range(len(case.lost)):
+    run, begun, ends = begin(reference, inputs), twin, False
+    for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
-        seen = seen_reference(now, reference, k, case.settings.ahead)
-        run = proceed(run, k, now, seen, case)
+        seen = seen_reference(now, reference, k, inputs.settings.ahead)
+        run = proceed(run, k, now, seen, inputs)
         if not ends:
-            twin, sent = slot(twin, seen, case, k)
+            twin, sent = slot(twin, seen, inputs, k)
             ends = not goes_on(twin, sent)
         if not run.goes_on:
             break
-    found = end(run, reference[0][1] - case.start.motion.y, case.settings.ts)
+    found = end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
     if ends or not run.goes_on:
         return found, math.inf
-    return found, apart(run.loop.motion, twin.motion) / apart(case.start.motion, begun.motion)
+    return found, apart(run.loop.motion, twin.motion) / apart(inputs.start.motion, begun.motion)
 
 
 def apart(one: Motion, other: Motion) -> float:

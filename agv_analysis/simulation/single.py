@@ -57,10 +57,10 @@ def simulate(scenario: Scenario) -> Run:
         reference=reference[:done],
         error=rows[:done, 3:6],
         command=rows[:done, 6:8],
-        n_ul=k - up.marks.held[:done],
-        lost=up.marks.lost[:done],
-        downlink_lost=down.marks.lost[:done],
-        n_dl=k - down.marks.held[:done],
+        n_ul=k - up.trace.held[:done],
+        lost=up.trace.lost[:done],
+        downlink_lost=down.trace.lost[:done],
+        n_dl=k - down.trace.held[:done],
         uplink=up.slots(done),
         downlink=down.slots(done),
         notes=tuple(_notes(scenario, done, steps, rows[:done, 6:8])),
@@ -70,7 +70,7 @@ def simulate(scenario: Scenario) -> Run:
 def _drive(
     reference: Rows, inputs: RunInputs, up: SimulatedLink, down: SimulatedLink, parts: Replacements
 ) -> tuple[Floats, int]:
-    """X_c, eps and u of a run's slots, shape (N, 8), and the number of slots until it ended; the links get their marks.
+    """X_c, eps and u of a run's slots, shape (N, 8), and the slots until it ended; fills the traces of the links.
 
     Where a message that is not lost is there at once, outcomes known beforehand are all that is needed of the radio.
     """
@@ -78,7 +78,7 @@ def _drive(
     if up.is_direct and down.is_direct:
         n_ul = np.empty(len(rows), dtype=np.int64)
         return rows, run_parts(history, parts, reference, inputs, rows, n_ul)
-    links = up.way, down.way, up.marks, down.marks
+    links = up.link_inputs, down.link_inputs, up.trace, down.trace
     return rows, run_parts(history_over_links, parts, reference, inputs, *links, rows)
 
 

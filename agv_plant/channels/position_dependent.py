@@ -1,6 +1,6 @@
 """Channels whose losses depend on where the AGV is when the message is sent.
 
-What such a model needs to know of the floor, holes or waves, is a table of floats, made once for a run; a verdict is a
+What such a model needs to know of the floor, holes or waves, is a table of floats, made once for a run; an outcome is a
 scalar function of that table, of two levels that may change while it runs, of the slot's uniform random number and of
 the place. The relay knows the place from the poses that it passes on; the downlink takes the one that it saw last.
 """
@@ -26,7 +26,7 @@ def kind_of(model: str) -> int:
     return PLACED.index(model) if model in PLACED else EVERYWHERE
 
 
-def verdict_at(
+def outcome_at(
     kind: int, spatial_table: Table, level: float, other: float, u: float, x: float, y: float
 ) -> tuple[bool, float]:
     """Is a message lost that is sent at the place (x, y) [m], and the channel's gain there [dB], NaN if it has none.

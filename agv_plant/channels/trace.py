@@ -1,4 +1,4 @@
-"""A channel that was measured: the verdicts of a CSV or JSON file, slot by slot."""
+"""A channel that was measured: the outcomes of a CSV or JSON file, slot by slot."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from pathlib import Path
 from agv_ros.errors import UserError, open_text
 
 ENDS = ("repeat", "hold", "stop")
-"""What follows the last verdict: the first one again, deliveries for ever, or an error."""
+"""What follows the last outcome: the first one again, deliveries for ever, or an error."""
 
 _WORDS = {
     "lost": {"0": False, "1": True},
     "verdict": {"delivered": False, "lost": True},
 }
-"""The columns that can hold verdicts, each with its words; True where lost."""
+"""The columns that can hold outcomes, each with its words; True where lost."""
 
 
 class TraceError(UserError):
     """A trace that cannot be used; the text names file, line and reason."""
 
 
-def trace(k: int, verdicts: Sequence[bool], end: str) -> bool:
-    """Verdict `k` of those measured, which are one at least; `end` is one of ENDS.
+def trace(k: int, outcomes: Sequence[bool], end: str) -> bool:
+    """Outcome `k` of those measured, which are one at least; `end` is one of ENDS.
 
     Loss rate and outages are the trace's own. Raises TraceError for a slot behind the end of a trace that may not be
     outrun.
     """
-    if k < len(verdicts):
-        return verdicts[k]
+    if k < len(outcomes):
+        return outcomes[k]
     if end == "stop":
         raise TraceError(
-            f"the trace ends after {len(verdicts)} slots, and slot {k} is asked for: make the run shorter, or set "
+            f"the trace ends after {len(outcomes)} slots, and slot {k} is asked for: make the run shorter, or set "
             "trace_end to repeat or hold"
         )
-    return end == "repeat" and verdicts[k % len(verdicts)]
+    return end == "repeat" and outcomes[k % len(outcomes)]
 
 
 def parse_trace(lines: Iterable[str], name: str) -> tuple[bool, ...]:
-    """Verdicts from the lines of a CSV file called `name` in messages, True where lost.
+    """Outcomes from the lines of a CSV file called `name` in messages, True where lost.
 
     The first line names the columns: `lost` (0 or 1) or `verdict` (delivered or lost), and, if the file says so
     itself, `k`, which must count 0, 1, 2 and so on. Further columns are passed over. Raises TraceError naming the line.
@@ -51,19 +51,19 @@ def parse_trace(lines: Iterable[str], name: str) -> tuple[bool, ...]:
         named = [column for column in _WORDS if column in header]
         if len(named) != 1:
             raise TraceError(f"{name}:1: one column must be called lost or verdict, found {','.join(header)!r}")
-        verdicts: list[bool] = []
+        outcomes: list[bool] = []
         for row in reader:
             if row:
                 cells = dict(zip(header, map(str.strip, row), strict=False))
-                verdicts.append(_verdict(cells, named[0], len(verdicts), f"{name}:{reader.line_num}"))
+                outcomes.append(_outcome(cells, named[0], len(outcomes), f"{name}:{reader.line_num}"))
     except csv.Error as error:
         raise TraceError(f"{name}:{reader.line_num}: {error}") from None
-    if not verdicts:
+    if not outcomes:
         raise TraceError(f"{name}: no rows below the header")
-    return tuple(verdicts)
+    return tuple(outcomes)
 
 
-def _verdict(cells: dict[str, str], column: str, k: int, where: str) -> bool:
+def _outcome(cells: dict[str, str], column: str, k: int, where: str) -> bool:
     if cells.get("k", str(k)) != str(k):
         raise TraceError(f"{where}: k must count 0, 1, 2 ..., expected {k}, found {cells['k']!r}")
     words, found = _WORDS[column], cells.get(column, "")
@@ -73,7 +73,7 @@ def _verdict(cells: dict[str, str], column: str, k: int, where: str) -> bool:
 
 
 def parse_json_trace(text: str, name: str) -> tuple[bool, ...]:
-    """Verdicts from the text of a JSON file called `name` in messages, True where lost.
+    """Outcomes from the text of a JSON file called `name` in messages, True where lost.
 
     An object with one list called `lost` (of 0 or 1) or `verdict` (of "delivered" or "lost"), an element a slot. Other
     members are passed over. Raises TraceError naming the line of broken JSON, or the element.
@@ -89,11 +89,11 @@ def parse_json_trace(text: str, name: str) -> tuple[bool, ...]:
     cells = [str(int(value)) if isinstance(value, bool) else str(value) for value in content[column]]
     if not cells:
         raise TraceError(f"{name}: the list {column} is empty")
-    return tuple(_verdict({column: cell}, column, k, f"{name}: {column}[{k}]") for k, cell in enumerate(cells))
+    return tuple(_outcome({column: cell}, column, k, f"{name}: {column}[{k}]") for k, cell in enumerate(cells))
 
 
 def load_trace(path: str) -> tuple[bool, ...]:
-    """Verdicts from a file whose name ends in .json, as `parse_json_trace`, or from any other, as `parse_trace`.
+    """Outcomes from a file whose name ends in .json, as `parse_json_trace`, or from any other, as `parse_trace`.
 
     Raises TraceError, for a recording too: it has to be turned into a trace first.
     """

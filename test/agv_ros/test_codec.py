@@ -103,7 +103,7 @@ def fields(value: Value, frame: str | None = None) -> dict[str, Any]:
     if isinstance(value, Command):
         return {"header": header, "twist": twist(value.v, value.w)}
     if isinstance(value, Slot):
-        return {"header": header, "time_ref": time(value.freshest_ns), "source": value.verdict}
+        return {"header": header, "time_ref": time(value.freshest_ns), "source": value.outcome}
     return {
         "header": header,
         "child_frame_id": "reference" if frame is None else frame[::-1],

@@ -16,7 +16,7 @@ from agv_analysis.link.channel_study import age_distribution, fitted, study
 from agv_analysis.link.markov_channel import bernoulli, gilbert_elliott
 from agv_analysis.link.netem import NetemError, from_netem, to_netem
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 
 AgvNcs = Callable[..., tuple[int, str]]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, chain_of, gilbert_elliott, shortest_mean_burst
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 from agv_ros.parameters import build
 
 probability = st.floats(0.01, 0.99)

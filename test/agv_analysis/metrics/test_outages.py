@@ -15,18 +15,18 @@ from agv_analysis.metrics.outages import age_statistics, ages, outage_lengths, o
 from agv_analysis.run import Run
 from agv_analysis.scenario import parse_scenario
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 from agv_ros.errors import UserError
 
-Verdicts = NDArray[np.bool_]
-verdicts = st.lists(st.booleans(), max_size=80).map(lambda values: np.array(values, dtype=np.bool_))
+Outcomes = NDArray[np.bool_]
+outcomes = st.lists(st.booleans(), max_size=80).map(lambda values: np.array(values, dtype=np.bool_))
 
 
-def run_of(lost: Verdicts, downlink_lost: Verdicts | None = None) -> Run:
-    """A run with these verdicts and nothing else in it; n_ul counted step by step."""
+def run_of(lost: Outcomes, downlink_lost: Outcomes | None = None) -> Run:
+    """A run with these outcomes and nothing else in it; n_ul counted step by step."""
     n_ul, age = [], 0
-    for verdict in lost:
-        age = age + 1 if verdict else 0
+    for outcome in lost:
+        age = age + 1 if outcome else 0
         n_ul.append(age)
     steps = len(lost)
     return Run(
@@ -42,8 +42,8 @@ def run_of(lost: Verdicts, downlink_lost: Verdicts | None = None) -> Run:
     )
 
 
-def of(text: str) -> Verdicts:
-    """Verdicts from a picture: `x` lost, `.` delivered."""
+def of(text: str) -> Outcomes:
+    """Outcomes from a picture: `x` lost, `.` delivered."""
     return np.array([letter == "x" for letter in text], dtype=np.bool_)
 
 
@@ -78,19 +78,19 @@ def test_the_downlink_has_outages_of_its_own() -> None:
     assert found.downlink.age.mean == 0.5
 
 
-@given(lost=verdicts)
+@given(lost=outcomes)
 @settings(deadline=None, derandomize=True)
-def test_lengths_are_those_of_the_runs_of_losses(lost: Verdicts) -> None:
-    expected = [len(list(group)) for verdict, group in groupby(lost.tolist()) if verdict]
+def test_lengths_are_those_of_the_runs_of_losses(lost: Outcomes) -> None:
+    expected = [len(list(group)) for outcome, group in groupby(lost.tolist()) if outcome]
     assert outage_lengths(np.arange(len(lost)), lost).tolist() == expected
 
 
-@given(lost=verdicts, start=st.integers(0, 10_000))
+@given(lost=outcomes, start=st.integers(0, 10_000))
 @settings(deadline=None, derandomize=True)
-def test_ages_count_from_the_last_reception(lost: Verdicts, start: int) -> None:
+def test_ages_count_from_the_last_reception(lost: Outcomes, start: int) -> None:
     expected, last = [], 0
-    for i, verdict in enumerate(lost):
-        last = last if verdict else i
+    for i, outcome in enumerate(lost):
+        last = last if outcome else i
         expected.append(i - last)
     assert ages(start + np.arange(len(lost)), lost).tolist() == expected
 

@@ -92,7 +92,7 @@ def test_a_note_is_read_as_far_as_it_can_be(tmp_path: Path) -> None:
     def noted(topic: str, k: int, data: bytes) -> list[bytes]:
         if topic != "/edge/slot" or k not in notes:
             return [data]
-        return [encode_slot(decode_slot(data)._replace(verdict=LOST if k == 3 else DELIVERED, note=notes[k]))]
+        return [encode_slot(decode_slot(data)._replace(outcome=LOST if k == 3 else DELIVERED, note=notes[k]))]
 
     run = read_run(changed_bag(tmp_path / "bag.mcap", noted))
     assert run.uplink is not None
@@ -110,7 +110,7 @@ def test_a_late_pose_is_missed_only_if_the_recording_goes_on_until_it_comes(tmp_
         if topic == "/edge/pose" and k == 1990:
             return []
         if topic == "/edge/slot" and k == 1990:
-            return [encode_slot(decode_slot(data)._replace(verdict=DELAYED, note=f"delay={8 if arrives else 9}"))]
+            return [encode_slot(decode_slot(data)._replace(outcome=DELAYED, note=f"delay={8 if arrives else 9}"))]
         return [data]
 
     run = read_run(changed_bag(tmp_path / "bag.mcap", late))
@@ -166,7 +166,7 @@ def test_a_recording_that_begins_and_ends_in_the_middle_is_whole(tmp_path: Path)
 
 def test_a_relay_that_was_started_again_and_names_no_pose_makes_none_older(tmp_path: Path) -> None:
     def forgotten(topic: str, k: int, data: bytes) -> list[bytes]:
-        if topic != "/edge/slot" or k < 1000 or decode_slot(data).verdict != LOST:
+        if topic != "/edge/slot" or k < 1000 or decode_slot(data).outcome != LOST:
             return [data]
         return [encode_slot(decode_slot(data)._replace(freshest_ns=0))]
 

@@ -21,7 +21,7 @@ from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import Channel, delay_draws, losses
+from agv_plant.radio.channel import Channel, delay_draws, losses
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:
@@ -83,11 +83,11 @@ def test_a_vehicle_s_own_channel_is_the_same_simulated(model: str) -> None:
     channel = ChannelParameters(
         model=model, p=0.3, r=0.4, vehicles=5, vehicle=4, delay=0.01, jitter=0.02, lifetime=0.02
     )
-    assert (losses(channel, 7, "downlink", 500) == ChannelRealisation(7, 500).verdicts(channel, "downlink")).all()
-    relay, way = Channel(channel, 7, "downlink"), ChannelRealisation(7, 500).way(channel, "downlink")
-    lost = ChannelRealisation(7, 500).verdicts(channel, "downlink")
+    assert (losses(channel, 7, "downlink", 500) == ChannelRealisation(7, 500).outcomes(channel, "downlink")).all()
+    relay, link_inputs = Channel(channel, 7, "downlink"), ChannelRealisation(7, 500).link_inputs(channel, "downlink")
+    lost = ChannelRealisation(7, 500).outcomes(channel, "downlink")
     waits = [math.ceil(relay.delays(k)[0] - 1e-9) for k in range(500) if not lost[k]]
-    assert np.asarray(way.waits)[~lost].tolist() == waits
+    assert np.asarray(link_inputs.waits)[~lost].tolist() == waits
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def changed(one: Path, other: Path, namespace: str) -> list[str]:
 
 
 def differences(recorded: Run, simulated: Run) -> list[str]:
-    """What of a recorded run is not as simulated: verdicts to the last bit, numbers to what the wire keeps of them."""
+    """What of a recorded run is not as simulated: outcomes to the last bit, numbers to what the wire keeps of them."""
     if len(recorded) != len(simulated):
         return [f"{len(recorded)} steps instead of {len(simulated)}"]
     exact = ("lost", "downlink_lost", "n_ul", "n_dl")

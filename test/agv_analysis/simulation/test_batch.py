@@ -1,4 +1,4 @@
-"""Batches: the same numbers whatever the number of workers, and verdicts that are those of the relay."""
+"""Batches: the same numbers whatever the number of workers, and outcomes that are those of the relay."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from agv_analysis.simulation import STATISTICS, simulate, simulate_batch
 from agv_analysis.simulation.batch import _Batch
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 from agv_ros.errors import UserError
 
 OUTAGES = str(Path(__file__).parents[3] / "config" / "outages.yaml")
@@ -42,10 +42,10 @@ def scenarios(*gains: float, duration: float = 2.0) -> list[Scenario]:
     ],
     ids=lambda channel: f"{channel.model} {channel.p:g} {channel.n}",
 )
-def test_verdicts_are_those_of_the_relay(channel: ChannelParameters) -> None:
+def test_outcomes_are_those_of_the_relay(channel: ChannelParameters) -> None:
     for seed, stream in ((1, "uplink"), (2**62, "downlink")):
         expected = losses(channel, seed, stream, 9000)  # more than two of the relay's blocks
-        assert np.array_equal(ChannelRealisation(seed, 9000).verdicts(channel, stream), expected)
+        assert np.array_equal(ChannelRealisation(seed, 9000).outcomes(channel, stream), expected)
 
 
 def test_the_number_of_workers_changes_nothing() -> None:

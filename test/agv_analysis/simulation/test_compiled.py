@@ -16,7 +16,7 @@ from agv_analysis.simulation import simulate
 from agv_analysis.simulation.loop import RunInputs, at_rest, history, statistics, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 
 ROOT = Path(__file__).parents[3]
 PAPER = str(ROOT / "config" / "paper.yaml")
@@ -119,7 +119,7 @@ import sys
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
 channel = ChannelParameters(model=sys.argv[1], p=0.5, r=0.5, n=2)
-print(*ChannelRealisation(3, 40).verdicts(channel, "uplink").astype(int), sep="")
+print(*ChannelRealisation(3, 40).outcomes(channel, "uplink").astype(int), sep="")
 """
 
 
@@ -130,9 +130,9 @@ def test_what_is_kept_of_one_channel_model_is_not_taken_for_another(tmp_path: Pa
     found = [in_another_process(LOST, tmp_path, model) for model in models]
     kept = sorted(tmp_path.rglob("*.nbc"))
     assert found[1] == f"0{'110' * 13}\n"
-    for model, verdicts in zip(models, found, strict=True):
+    for model, outcomes in zip(models, found, strict=True):
         expected = losses(ChannelParameters(model=model, p=0.5, r=0.5, n=2), 3, "uplink", 40)
-        assert verdicts == "".join(map(str, expected.astype(int))) + "\n"
+        assert outcomes == "".join(map(str, expected.astype(int))) + "\n"
     assert [in_another_process(LOST, tmp_path, model) for model in models] == found
     assert sorted(tmp_path.rglob("*.nbc")) == kept, "what was kept was not found again"
 

@@ -140,8 +140,8 @@ def agree(recorded: Run) -> None:
     """Is the simulation of a recorded run's scenario that run, step by step?"""
     simulated = simulate(recorded.scenario)
     assert len(recorded) == len(simulated) == round(recorded.scenario.plant.duration / recorded.ts)
-    for verdict in ("lost", "downlink_lost", "n_ul", "n_dl"):
-        assert np.array_equal(getattr(recorded, verdict), getattr(simulated, verdict)), verdict
+    for outcome in ("lost", "downlink_lost", "n_ul", "n_dl"):
+        assert np.array_equal(getattr(recorded, outcome), getattr(simulated, outcome)), outcome
     for said, true in ((recorded.uplink, simulated.uplink), (recorded.downlink, simulated.downlink)):
         assert said is not None
         assert true is not None

@@ -24,7 +24,7 @@ TS, LAP = 0.005, 20_000
 
 @dataclass
 class Naive:
-    """The loop of the paper with outages on both links, for verdicts that are given."""
+    """The loop of the paper with outages on both links, for outcomes that are given."""
 
     kx: float
     v_max: float

@@ -18,7 +18,7 @@ from agv_analysis.metrics.convergence import convergence
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_plant.radio.link import Channel
+from agv_plant.radio.channel import Channel
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
@@ -96,7 +96,7 @@ def test_a_wide_miss_is_a_bounded_cycle_once_the_speed_is_limited() -> None:
     assert np.max(np.abs(run.command[:, 0])) == 6.0
 
 
-def test_verdicts_are_those_of_the_relay() -> None:
+def test_outcomes_are_those_of_the_relay() -> None:
     run = run_of(
         "relay.uplink.model=gilbert_elliott", "relay.uplink.p=0.1", "relay.uplink.r=0.3", "relay.uplink.h=0.2",
         "relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "relay.seed=9", "plant.duration=5.0",

@@ -16,7 +16,7 @@ from agv_analysis.stability.lifted import spectral_radius
 from agv_analysis.stability.variable_delay import age_sequence
 from agv_cloud.parameters import ControllerParameters
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 
 TS, STEPS = 0.005, 4000
 GAINS = ControllerParameters(kx=25.0, ky=1.0, ktheta=2.0)

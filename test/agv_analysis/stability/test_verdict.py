@@ -14,7 +14,7 @@ from agv_analysis.simulation import simulate
 from agv_analysis.stability.analysis import Analysis, analyse
 from agv_analysis.stability.verdict import judge
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 
 REPOSITORY = Path(__file__).parents[3]
 

@@ -24,15 +24,15 @@ from agv_plant.channels.burst import burst
 from agv_plant.channels.gilbert_elliott import gilbert_elliott
 from agv_plant.channels.perfect import perfect
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 from agv_ros.parameters import build
 
-Verdicts = NDArray[np.bool_]
+Outcomes = NDArray[np.bool_]
 STEPS = 200_000
 
 
-def run_lengths(lost: Verdicts, of: bool) -> NDArray[np.int64]:
-    """Lengths of the runs of one verdict, without the first and the last run, which may be cut."""
+def run_lengths(lost: Outcomes, of: bool) -> NDArray[np.int64]:
+    """Lengths of the runs of one outcome, without the first and the last run, which may be cut."""
     runs = [(value, sum(1 for _ in group)) for value, group in groupby(lost.tolist())][1:-1]
     return np.array([length for value, length in runs if value == of], dtype=np.int64)
 
@@ -269,7 +269,7 @@ def test_streams_and_seeds_are_independent(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_same_source_gives_the_same_verdicts(model: str) -> None:
+def test_the_same_source_gives_the_same_outcomes(model: str) -> None:
     first, second = (losses(EVERY_MODEL[model], 3, "uplink", 5000) for _ in range(2))
     assert (first == second).all()
     assert not first[0]
@@ -302,4 +302,4 @@ def test_a_downlink_of_the_same_fate_loses_what_the_uplink_loses(model: str) -> 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_the_simulation_draws_the_same_correlated_numbers(stream: str, share: float) -> None:
     channel = dataclasses.replace(EVERY_MODEL["gilbert_elliott"], correlation=share)
-    assert (ChannelRealisation(7, 9000).verdicts(channel, stream) == losses(channel, 7, stream, 9000)).all()
+    assert (ChannelRealisation(7, 9000).outcomes(channel, stream) == losses(channel, 7, stream, 9000)).all()

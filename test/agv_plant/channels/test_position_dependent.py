@@ -28,7 +28,7 @@ from agv_plant.channels.position_dependent import PLACED
 from agv_plant.channels.rayleigh import SPEED_OF_LIGHT, fades_per_metre, fading_gain, loss_rate
 from agv_plant.channels.rayleigh import rows_of as waves_of
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import Channel, losses
+from agv_plant.radio.channel import Channel, losses
 from agv_ros.parameters import ParameterError
 
 NONE = (0.0,)
@@ -173,10 +173,10 @@ def test_fades_come_and_last_as_clarke_says(margin: float) -> None:
     """Level-crossing rate and mean length of a fade along straight lines of 100 wavelengths, finely sampled."""
     rho = 10.0 ** (-margin / 20.0)
     length, steps = 100.0 * WAVELENGTH, 10_000
-    way = np.linspace(0.0, length, steps)
+    path = np.linspace(0.0, length, steps)
     fades, shares = [], []
     for seed in range(30):
-        bad = power(seed, way * math.cos(0.4), way * math.sin(0.4)) < rho**2
+        bad = power(seed, path * math.cos(0.4), path * math.sin(0.4)) < rho**2
         fades.append(np.count_nonzero(~bad[:-1] & bad[1:]) / length)
         shares.append(np.mean(bad))
     rate = math.sqrt(2.0 * math.pi) * rho * math.exp(-(rho**2)) / WAVELENGTH
@@ -192,15 +192,17 @@ def test_speed_makes_fades_shorter_and_not_rarer(speed: float) -> None:
     """Outages in slots, of the very channel that nodes and simulation ask, against f_D = v / lambda."""
     c = ChannelParameters(model="rayleigh", margin=6.0, carrier=CARRIER)
     steps, ts = 30_000, 0.001
-    way = np.arange(steps) * speed * ts
+    path = np.arange(steps) * speed * ts
     outages, rates = [], []
     for seed in range(12):
-        marks = empty_trace(steps)
+        trace = empty_trace(steps)
         compiled(listen)(
-            ChannelRealisation(seed, steps, ts).way(c, "uplink"), marks, np.column_stack([way, 0.5 * np.ones(steps)])
+            ChannelRealisation(seed, steps, ts).link_inputs(c, "uplink"),
+            trace,
+            np.column_stack([path, 0.5 * np.ones(steps)]),
         )
-        outages.append(np.count_nonzero(~marks.lost[:-1] & marks.lost[1:]))
-        rates.append(np.mean(marks.lost))
+        outages.append(np.count_nonzero(~trace.lost[:-1] & trace.lost[1:]))
+        rates.append(np.mean(trace.lost))
     expected = fades_per_metre(CARRIER, 6.0) * speed * ts * steps
     assert abs(np.mean(outages) - expected) < 5.0 * np.std(outages) / math.sqrt(len(outages)) + expected / 64.0
     assert abs(np.mean(rates) - loss_rate(6.0)) < 5.0 * np.std(rates) / math.sqrt(len(rates)) + 0.01
@@ -222,7 +224,7 @@ def test_a_correlated_downlink_s_gain(correlation: float) -> None:
     for seed in range(150):
         up, down = Channel(c, seed, "uplink"), Channel(c, seed, "downlink")
         places = rng.uniform(-1e3, 1e3, (60, 2)).tolist()
-        gains = np.array([[up.judge(1, *place).gain, down.judge(1, *place).gain] for place in places])
+        gains = np.array([[up.outcome(1, *place).gain, down.outcome(1, *place).gain] for place in places])
         one, other = 10.0 ** (gains.T / 10.0)
         found.append(np.mean(one * other) - np.mean(one) * np.mean(other))
     spread = np.std(found) / math.sqrt(len(found))
@@ -242,29 +244,29 @@ def test_every_one_is_tested_here() -> None:
 
 
 @pytest.mark.parametrize("model", PLACES)
-def test_the_relay_s_verdicts_are_the_simulation_s(model: str) -> None:
+def test_the_relay_s_outcomes_are_the_simulation_s(model: str) -> None:
     steps = 3000
     places = np.column_stack([np.linspace(-3.0, 3.0, steps), np.linspace(2.0, 8.0, steps)])
     for stream in ("uplink", "downlink"):
-        marks, channel = empty_trace(steps), Channel(PLACES[model], 9, stream)
-        compiled(listen)(ChannelRealisation(9, steps).way(PLACES[model], stream), marks, places)
-        alone = [channel.judge(k, *place) for k, place in enumerate(places.tolist())]
-        assert np.array_equal(marks.lost, [one.lost for one in alone])
-        np.testing.assert_allclose(marks.gain, [one.gain for one in alone], rtol=0.0, atol=1e-9)
+        trace, channel = empty_trace(steps), Channel(PLACES[model], 9, stream)
+        compiled(listen)(ChannelRealisation(9, steps).link_inputs(PLACES[model], stream), trace, places)
+        alone = [channel.outcome(k, *place) for k, place in enumerate(places.tolist())]
+        assert np.array_equal(trace.lost, [one.lost for one in alone])
+        np.testing.assert_allclose(trace.gain, [one.gain for one in alone], rtol=0.0, atol=1e-9)
         order = np.random.default_rng(4).permutation(steps)[:200].tolist()
         again = Channel(PLACES[model], 9, stream)
-        assert [again.judge(k, *places[k].tolist()).lost for k in order] == [alone[k].lost for k in order]
+        assert [again.outcome(k, *places[k].tolist()).lost for k in order] == [alone[k].lost for k in order]
 
 
 @pytest.mark.parametrize("model", PLACES)
 def test_seeds_and_streams_differ(model: str) -> None:
     steps = 4000
-    way = np.column_stack([np.linspace(-10.0, 10.0, steps), np.full(steps, 5.0)])
+    path = np.column_stack([np.linspace(-10.0, 10.0, steps), np.full(steps, 5.0)])
 
     def lost(seed: int, stream: str) -> list[bool]:
-        marks = empty_trace(steps)
-        compiled(listen)(ChannelRealisation(seed, steps).way(PLACES[model], stream), marks, way)
-        found: list[bool] = marks.lost.tolist()
+        trace = empty_trace(steps)
+        compiled(listen)(ChannelRealisation(seed, steps).link_inputs(PLACES[model], stream), trace, path)
+        found: list[bool] = trace.lost.tolist()
         return found
 
     assert lost(1, "uplink") == lost(1, "uplink")

@@ -22,10 +22,10 @@ CHANNEL = ("--set", "relay.uplink.model=roadworks", "--set", "relay.uplink.argum
 SAME = """
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 channel = ChannelParameters(model="roadworks", arguments=(0.5, 20.0, 200.0))
 found = losses(channel, 3, "uplink", 5000)
-assert (ChannelRealisation(3, 5000).verdicts(channel, "uplink") == found).all()
+assert (ChannelRealisation(3, 5000).outcomes(channel, "uplink") == found).all()
 print("".join(str(int(lost)) for lost in found))
 """
 
@@ -75,7 +75,7 @@ def expected(seed: int, slots: int) -> list[bool]:
     return [k > 0 and k % period < length and u < p for k, u in enumerate(draws)]
 
 
-def test_nodes_and_simulation_have_its_verdicts(package: Path) -> None:
+def test_nodes_and_simulation_have_its_outcomes(package: Path) -> None:
     code, said = python(package, "-c", SAME)
     assert code == 0, said
     assert said.strip() == "".join(str(int(lost)) for lost in expected(3, 5000))

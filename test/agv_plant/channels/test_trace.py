@@ -1,4 +1,4 @@
-"""The measured channel: verdicts of a file, the same in the nodes and in the simulation."""
+"""The measured channel: outcomes of a file, the same in the nodes and in the simulation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.single import simulate
 from agv_plant.channels.trace import TraceError, load_trace, parse_json_trace, parse_trace, trace
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import Channel, losses
+from agv_plant.radio.channel import Channel, losses
 from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:
@@ -98,11 +98,11 @@ def test_ends() -> None:
 
 
 @pytest.mark.parametrize("end", ["repeat", "hold"])
-def test_the_simulation_s_verdicts_are_the_relay_s(measured: Path, end: str) -> None:
+def test_the_simulation_s_outcomes_are_the_relay_s(measured: Path, end: str) -> None:
     c = ChannelParameters(model="trace", trace_file=str(measured), trace_end=end)
     expected = MEASURED * 3 if end == "repeat" else MEASURED + [False] * 14
     assert losses(c, 1, "uplink", 21).tolist() == expected
-    assert ChannelRealisation(1, 21).verdicts(c, "downlink").tolist() == expected
+    assert ChannelRealisation(1, 21).outcomes(c, "downlink").tolist() == expected
     channel = Channel(c, 1, "uplink")
     assert [channel.lost(k) for k in reversed(range(21))] == expected[::-1]
 
@@ -111,7 +111,7 @@ def test_slot_0_is_never_lost(tmp_path: Path) -> None:
     (tmp_path / "all.csv").write_text("lost\n1\n1\n")
     c = ChannelParameters(model="trace", trace_file=str(tmp_path / "all.csv"))
     assert losses(c, 1, "uplink", 5).tolist() == [False, True, True, True, True]
-    assert ChannelRealisation(1, 5).verdicts(c, "uplink").tolist() == [False, True, True, True, True]
+    assert ChannelRealisation(1, 5).outcomes(c, "uplink").tolist() == [False, True, True, True, True]
 
 
 # -- runs --------------------------------------------------------------------------------------------------------------

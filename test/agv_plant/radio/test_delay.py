@@ -22,8 +22,9 @@ from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.margins import left_out
 from agv_analysis.stability.verdict import ASYMPTOTIC, UNKNOWN, UNSTABLE
 from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.channel import Channel, losses
 from agv_plant.radio.delay import EXPIRED, delay_in_slots, whole_slots
-from agv_plant.radio.link import Channel, Link, losses
+from agv_plant.radio.link import Link
 from agv_ros.messages import DELAYED, DELIVERED, LOST, facts_in
 from agv_ros.stamps import Grid
 from test.agv_plant.radio.test_two_links import last_words
@@ -116,7 +117,7 @@ def test_a_copy_may_come_in_time_where_the_message_does_not() -> None:
     c = ChannelParameters(delay=0.02, jitter=0.02, lifetime=0.02, duplicate=1.0)
     lost = losses(c, 1, "uplink", 20_000, TS)
     assert abs(lost.mean() - 0.25) < 5.0 * math.sqrt(0.25 * 0.75 / 20_000)
-    assert np.array_equal(ChannelRealisation(1, 20_000, TS).verdicts(c, "uplink"), lost)
+    assert np.array_equal(ChannelRealisation(1, 20_000, TS).outcomes(c, "uplink"), lost)
 
 
 def test_a_new_run_hears_nothing_of_what_was_under_way() -> None:
@@ -135,9 +136,9 @@ def test_a_link_counts_the_late_ones_and_the_copies() -> None:
 
 
 def blank_run(c: ChannelParameters, steps: int, seed: int = 1) -> LinkTrace:
-    marks = empty_trace(steps)
-    listen(ChannelRealisation(seed, steps, TS).way(c, "uplink"), marks, [[0.0, 0.0]] * steps)
-    return marks
+    trace = empty_trace(steps)
+    listen(ChannelRealisation(seed, steps, TS).link_inputs(c, "uplink"), trace, [[0.0, 0.0]] * steps)
+    return trace
 
 
 @settings(deadline=None, derandomize=True, max_examples=30)
@@ -236,9 +237,9 @@ def test_a_predictor_with_an_exact_model_does_not_mind() -> None:
 
 def test_what_comes_too_late_or_twice_is_put_aside_and_counted(drive: Callable[..., Run], tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    way = ("delay=0.01", "jitter=0.03", "duplicate=0.4", "model=bernoulli", "p=0.1")
+    settings = ("delay=0.01", "jitter=0.03", "duplicate=0.4", "model=bernoulli", "p=0.1")
     run = drive(
-        *(f"relay.{link}.{setting}" for link in ("uplink", "downlink") for setting in way), "plant.duration=3.0",
+        *(f"relay.{link}.{setting}" for link in ("uplink", "downlink") for setting in settings), "plant.duration=3.0",
         bag=tmp_path / "bag",
     )  # fmt: skip
     assert run.unexplained == {}

@@ -18,7 +18,7 @@ from agv_analysis.cli import main
 from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import Channel, losses
+from agv_plant.radio.channel import Channel, losses
 from agv_plant.radio.schedule import OUTAGE, is_scripted
 from agv_ros.parameters import ParameterError, build
 from agv_ros.ros_yaml import load
@@ -50,9 +50,9 @@ def test_an_outage_comes_once_or_again_and_again_until_another_word() -> None:
     c = scheduled("20: outage=0.3 every 5; 34: outage=0; 40: outage=1", ChannelParameters())
     expected = {k for first in (20, 25, 30) for k in range(first * 200, first * 200 + 60)} | set(range(8000, 8200))
     channel = Channel(c, 1, "downlink", TS)
-    verdicts = [channel.judge(k) for k in range(STEPS)]
-    assert {k for k, verdict in enumerate(verdicts) if verdict.lost} == expected
-    assert {verdict.cause for verdict in verdicts} == {"", OUTAGE}
+    outcomes = [channel.outcome(k) for k in range(STEPS)]
+    assert {k for k, outcome in enumerate(outcomes) if outcome.lost} == expected
+    assert {outcome.cause for outcome in outcomes} == {"", OUTAGE}
 
 
 def test_losses_of_the_model_come_on_top() -> None:
@@ -85,11 +85,11 @@ SCHEDULES = {
 
 @pytest.mark.parametrize("c", SCHEDULES.values(), ids=SCHEDULES)
 def test_the_simulation_follows_it_as_the_relay_does(c: ChannelParameters) -> None:
-    assert np.array_equal(ChannelRealisation(5, STEPS, TS).verdicts(c, "uplink"), losses(c, 5, "uplink", STEPS, TS))
+    assert np.array_equal(ChannelRealisation(5, STEPS, TS).outcomes(c, "uplink"), losses(c, 5, "uplink", STEPS, TS))
 
 
 @pytest.mark.parametrize("c", SCHEDULES.values(), ids=SCHEDULES)
-def test_verdicts_do_not_depend_on_what_was_asked_before(c: ChannelParameters) -> None:
+def test_outcomes_do_not_depend_on_what_was_asked_before(c: ChannelParameters) -> None:
     expected, channel = losses(c, 5, "uplink", STEPS, TS), Channel(c, 5, "uplink", TS)
     for k in (8000, 10, 5000, 5000, 4999, 0, 1001, 1000):
         assert channel.lost(k) == expected[k]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import Channel, losses
+from agv_plant.radio.channel import Channel, losses
 from agv_plant.radio.shared_uplink import OLDEST_FIRST, RANDOM, ROUND_ROBIN, SCHEDULERS, serve_all
 from agv_ros.parameters import ParameterError
 
@@ -75,7 +75,7 @@ def test_every_vehicle_s_relay_works_out_the_same_schedule(scheduler: str) -> No
     fleet = [ChannelParameters(model="shared", vehicles=5, vehicle=i, blocks=2, scheduler=scheduler) for i in range(5)]
     lost = np.array([losses(channel, 7, "uplink", 300) for channel in fleet])
     assert (np.count_nonzero(~lost[:, 1:], axis=0) == 2).all()
-    assert (lost == [ChannelRealisation(7, 300).verdicts(channel, "uplink") for channel in fleet]).all()
+    assert (lost == [ChannelRealisation(7, 300).outcomes(channel, "uplink") for channel in fleet]).all()
 
 
 def test_a_lossy_cell_with_a_schedule_is_the_same_simulated() -> None:
@@ -84,7 +84,7 @@ def test_a_lossy_cell_with_a_schedule_is_the_same_simulated() -> None:
     )
     lost = losses(channel, 3, "uplink", 400)
     assert lost[100:].mean() > lost[:100].mean()
-    assert (lost == ChannelRealisation(3, 400).verdicts(channel, "uplink")).all()
+    assert (lost == ChannelRealisation(3, 400).outcomes(channel, "uplink")).all()
     anew = Channel(channel, 3, "uplink")
     assert [anew.lost(k) for k in (250, 10, 11, 399)] == [lost[k] for k in (250, 10, 11, 399)]
 

@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.simulation.single import simulate
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 
 if TYPE_CHECKING:
     from test.conftest import Drive

@@ -1,0 +1,198 @@
+"""Outcomes of one direction of the radio: is the message of slot k lost, why, and how long is it under way?"""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_plant.channels import GOOD, Model
+from agv_plant.channels.position_dependent import NOWHERE, kind_of, outcome_at
+from agv_plant.channels.registry import SHARED, TRACE, ChannelError, find_model
+from agv_plant.channels.trace import TraceError, load_trace, trace
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.channel_setup import UPLINK, Segment, levels_of, segments_of, spatial_table_of
+from agv_plant.radio.delay import EXPIRED, delays_of
+from agv_plant.radio.schedule import OUTAGE, is_scripted
+from agv_plant.radio.shared_uplink import SCHEDULERS, serve, stream_of
+from agv_plant.random_stream import InBlocks, uniforms
+from agv_ros.parameters import LoopParameters
+
+_BLOCK = 4096
+
+
+def own_stream(parameters: ChannelParameters, stream: str) -> str:
+    """Name of a vehicle's random numbers on a link; those of the first have the link's own name."""
+    return stream_of(stream, parameters.vehicle) if parameters.vehicle else stream
+
+
+def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
+    """Random numbers of a channel's slots first .. first + count - 1, uniform in [0, 1), shape (count, DRAWS).
+
+    In a share `correlation` of the slots they are those of the uplink. Of two equal channels without memory the losses
+    then have exactly this correlation coefficient.
+    """
+    own = uniforms(seed, own_stream(parameters, stream), first, count)
+    if parameters.correlation == 0.0:
+        return own
+    shared = uniforms(seed, f"{stream}/correlation", first, count)[:, :1] < parameters.correlation
+    return np.where(shared, uniforms(seed, UPLINK, first, count), own)
+
+
+def delay_draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
+    """The same for delays, those of a link alone."""
+    return uniforms(seed, f"{own_stream(parameters, stream)}/delay", first, count)
+
+
+class SlotOutcome(NamedTuple):
+    """What the channel does to the message of a slot, and why."""
+
+    lost: bool
+    cause: str = ""
+    """The channel's model, `outage` if the schedule says so, or `expired`; empty if the message is not lost."""
+    state: int = GOOD
+    """The state that decided, of a channel with memory."""
+    gain: float = math.nan
+    """Of the channel [dB], NaN if it has none."""
+
+
+def _in_blocks(make: Callable[[int, int], NDArray[np.float64]]) -> InBlocks[list[float]]:
+    return InBlocks(lambda first, count: make(first, count).tolist(), _BLOCK)
+
+
+class _SharedUplinkModel:
+    """The uplink that a fleet shares, as a model that is asked for each slot in turn."""
+
+    def __init__(self, parameters: ChannelParameters, seed: int, link: str) -> None:
+        self._scheduler = SCHEDULERS.index(parameters.scheduler)
+        self._drawn = [
+            _in_blocks(functools.partial(uniforms, seed, stream_of(link, vehicle)))
+            for vehicle in range(parameters.vehicles)
+        ]
+        self._ages = [0] * parameters.vehicles
+
+    def __call__(self, channel: ChannelParameters, k: int, _: Sequence[float], state: int) -> tuple[bool, int]:
+        """As any `Model`; what it remembers of the other vehicles begins anew with slot 0."""
+        if k == 0:
+            self._ages = [0] * channel.vehicles
+        turns, fates = zip(*(drawn.at(k)[:2] for drawn in self._drawn), strict=True)
+        lost = [False] * channel.vehicles
+        serve(k, channel.blocks, self._scheduler, channel.p, turns, fates, self._ages, lost)
+        return lost[channel.vehicle], state
+
+
+def _model_of(parameters: ChannelParameters, seed: int, stream: str) -> Model:
+    return _SharedUplinkModel(parameters, seed, stream) if parameters.model == SHARED else find_model(parameters.model)
+
+
+class Channel:
+    """Outcomes of one channel, a pure function of (parameters, seed, stream name, k) and, for some, of the place.
+
+    The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot
+    0, so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
+    A measured channel's file is read here, once. Raises TraceError if it cannot be used, ChannelError for a model of
+    another package that cannot be loaded.
+    """
+
+    def __init__(self, parameters: ChannelParameters, seed: int, stream: str, ts: float = LoopParameters.ts) -> None:
+        self._ts = ts
+        self.parameters = parameters
+        measured = parameters.model == TRACE
+        self._kind = kind_of(parameters.model)
+        self._spatial_table = spatial_table_of(parameters, seed, stream) if parameters.is_placed else []
+        self._trace = load_trace(parameters.trace_file) if measured else ()
+        self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
+        self._random = _in_blocks(lambda first, count: draws(self.parameters, seed, stream, first, count))
+        self._random_delays = _in_blocks(lambda first, count: delay_draws(self.parameters, seed, stream, first, count))
+        self._next = 0
+        self._state = GOOD
+        self._last = SlotOutcome(False)
+
+    @property
+    def parameters(self) -> ChannelParameters:
+        """Those that its schedule starts from."""
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, parameters: ChannelParameters) -> None:
+        self._parameters = parameters
+        self._segments = segments_of(parameters, self._ts)
+        self._firsts = [segment.first for segment in self._segments]
+        self._may_expire = any(segment.channel.lifetime < math.inf for segment in self._segments)
+        self._has_outages = any(segment.outage.length > 0.0 for segment in self._segments)
+
+    def lost(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> bool:
+        """Is the message of slot `k` lost, sent when the AGV is at (x, y) [m]?"""
+        return self.outcome(k, x, y).lost
+
+    def outcome(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> SlotOutcome:
+        """The outcome on the message of slot `k`. Slot 0 is never lost: a run begins with the AGV known to the edge."""
+        outcome = self._by_place(k, x, y) if self._kind else self._by_slot(k)
+        if k == 0:
+            return outcome._replace(lost=False, cause="")
+        if self._has_outages and is_scripted(k, *self._segment(k).outage, self._ts):
+            return outcome._replace(lost=True, cause=OUTAGE)
+        if self._may_expire and max(self.delays(k)) < 0.0:
+            return outcome._replace(lost=True, cause=EXPIRED)
+        return outcome
+
+    def delays(self, k: int) -> tuple[float, float]:
+        """Slots that the message of slot `k` is under way if it is not lost, and its copy; -1 for what never comes."""
+        c = self._segment(k).channel
+        if c.delay + c.jitter + c.duplicate == 0.0:
+            return 0.0, -1.0
+        u_delay, u_twice, u_copy, _ = self._random_delays.at(k)
+        return delays_of(k, u_delay, u_twice, u_copy, c.delay, c.jitter, c.duplicate, c.lifetime, self._ts)
+
+    def _segment(self, k: int) -> Segment:
+        if len(self._segments) == 1:
+            return self._segments[0]
+        return self._segments[bisect.bisect_right(self._firsts, k) - 1]
+
+    def _by_place(self, k: int, x: float, y: float) -> SlotOutcome:
+        levels, u = levels_of(self._segment(k).channel), self._random.at(k)[0]
+        lost, gain = outcome_at(self._kind, self._spatial_table, *levels, u, x, y)
+        return SlotOutcome(lost, self.parameters.model if lost else "", GOOD, gain)
+
+    def _by_slot(self, k: int) -> SlotOutcome:
+        if self._model is None:
+            lost = self._measured(k)
+            return SlotOutcome(lost, TRACE if lost else "")
+        if k < self._next - 1:
+            self._next, self._state = 0, GOOD
+        while self._next <= k:
+            before = self._state
+            try:
+                lost, self._state = self._model(
+                    self._segment(self._next).channel, self._next, self._random.at(self._next), before
+                )
+            except Exception as error:  # another package's model, in which anything can go wrong
+                raise ChannelError(f"channel model {self.parameters.model}, slot {self._next}: {error}") from error
+            self._last = SlotOutcome(bool(lost), self.parameters.model if lost else "", before)
+            self._next += 1
+        return self._last
+
+    def _measured(self, k: int) -> bool:
+        try:
+            return trace(k, self._trace, self.parameters.trace_end)
+        except TraceError as error:
+            raise TraceError(f"{self.parameters.trace_file}: {error}") from None
+
+
+def check_length(parameters: ChannelParameters, steps: float) -> None:
+    """Is a trace that may not be outrun long enough for a run of `steps`? Raises TraceError before the run if not."""
+    if parameters.model == TRACE and math.isfinite(steps):
+        Channel(parameters, 0, "").lost(max(0, round(steps) - 1))
+
+
+def losses(
+    parameters: ChannelParameters, seed: int, stream: str, steps: int, ts: float = LoopParameters.ts
+) -> NDArray[np.bool_]:
+    """Outcomes of the slots 0 .. steps - 1 of an AGV that is nowhere, True where lost, shape (steps,)."""
+    channel = Channel(parameters, seed, stream, ts)
+    return np.fromiter((channel.lost(k) for k in range(steps)), dtype=np.bool_, count=steps)
