@@ -14,7 +14,6 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
-from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -25,9 +24,6 @@ Point = tuple[float, float]
 
 _SAME_PLACE = 1e-6
 """Points nearer than this to the one before them [m], or to the line's end [steps], are the same."""
-
-_KEPT = 16
-"""How many paths back the reference is known: of the last 16 s, if the planner plans once a second."""
 
 
 class PathError(ValueError):
@@ -108,7 +104,7 @@ class PathTrack:
     """A path driven from its beginning to its end, where the reference stands still: its points by step."""
 
     def __init__(self, curve: Curve, speed: float, ts: float) -> None:
-        self._curve = curve
+        self.curve = curve
         self._advance = speed * ts
         self._ts = ts
         self.steps = max(1, math.ceil(curve.length / self._advance - _SAME_PLACE))
@@ -117,46 +113,17 @@ class PathTrack:
     def __getitem__(self, step: int) -> ReferencePoint:
         """The reference `step` >= 0 steps after its beginning."""
         if step >= self.steps:
-            x, y, _ = self._curve.at(self._curve.length)
+            x, y, _ = self.curve.at(self.curve.length)
             return ReferencePoint(x, y, self._move(self.steps - 1)[0], 0.0, 0.0)
-        x, y, _ = self._curve.at(step * self._advance)
+        x, y, _ = self.curve.at(step * self._advance)
         heading, distance = self._move(step)
         turn = math.remainder(self._move(min(step + 1, self.steps - 1))[0] - heading, math.tau)
         return ReferencePoint(x, y, heading, distance / self._ts, turn / self._ts)
 
     def _move(self, step: int) -> tuple[float, float]:
         """Direction [rad] and distance [m] from one step to the next."""
-        x, y, theta = self._curve.at(step * self._advance)
-        end = self._curve.length if step + 1 == self.steps else (step + 1) * self._advance
-        to_x, to_y, _ = self._curve.at(end)
+        x, y, theta = self.curve.at(step * self._advance)
+        end = self.curve.length if step + 1 == self.steps else (step + 1) * self._advance
+        to_x, to_y, _ = self.curve.at(end)
         distance = math.hypot(to_x - x, to_y - y)
         return (math.atan2(to_y - y, to_x - x) if distance else theta), distance
-
-
-class PathReference:
-    """X_r by step where paths come in a running loop: each replaces the one before it from its own beginning on."""
-
-    def __init__(self) -> None:
-        self._tracks: deque[tuple[int, PathTrack]] = deque(maxlen=_KEPT)
-        self._next: PathTrack | None = None
-
-    def replace(self, track: PathTrack) -> None:
-        """Drive this path from the next step on that is answered."""
-        self._next = track
-
-    def begin(self, k: int) -> None:
-        """Step k is answered now: a path that has come before it begins with it."""
-        if self._next is not None:
-            self._tracks.append((k, self._next))
-            self._next = None
-
-    def restart(self) -> None:
-        """A run begins anew, and so does the newest path."""
-        if self._next is None and self._tracks:
-            self._next = self._tracks[-1][1]
-        self._tracks.clear()
-
-    def __getitem__(self, k: int) -> ReferencePoint | None:
-        """The reference at step k; None before the first path."""
-        found = next(((begin, track) for begin, track in reversed(self._tracks) if begin <= k), None)
-        return None if found is None else found[1][k - found[0]]

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agv_cloud.parameters import ErrorDetectorParameters
-from agv_cloud.reference.path_track import Curve, PathError, PathReference, PathTrack
+from agv_cloud.reference.path_track import Curve, PathError, PathTrack
 from agv_cloud.reference.reference import Reference
 from agv_cloud.reference.thinned_path import MOST_POINTS, thinned
 from agv_plant.vehicle.unicycle import euler_step
@@ -121,34 +121,6 @@ def test_the_way_back_is_begun_by_a_turn_on_the_spot() -> None:
 def test_what_cannot_be_driven_is_refused(path: list[tuple[float, float]], reason: str) -> None:
     with pytest.raises(PathError, match=reason):
         Curve(path, 0.2)
-
-
-def test_a_path_begins_with_the_step_that_is_answered_after_it_came() -> None:
-    reference, first = PathReference(), track_of([(0.0, 0.0), (1.0, 0.0)])
-    second = track_of([(5.0, 5.0), (5.0, 9.0)])
-    reference.begin(3)
-    assert reference[3] is None
-    reference.replace(first)
-    for k in (4, 5):
-        reference.begin(k)
-    assert [reference[k] for k in (3, 4, 5, 9)] == [None, first[0], first[1], first[5]]
-    reference.replace(second)
-    assert reference[9] == first[5]
-    reference.begin(9)
-    assert [reference[k] for k in (8, 9, 10)] == [first[4], second[0], second[1]]
-
-
-def test_paths_of_long_ago_are_forgotten_and_a_run_that_begins_anew_has_the_newest() -> None:
-    reference, tracks = PathReference(), [track_of([(float(i), 0.0), (i + 1.0, 0.0)]) for i in range(40)]
-    for k, track in enumerate(tracks):
-        reference.replace(track)
-        reference.begin(10 * k)
-    assert reference[0] is None
-    assert [reference[10 * k] for k in range(30, 40)] == [track[0] for track in tracks[30:]]
-    reference.restart()
-    assert reference[395] is None
-    reference.begin(0)
-    assert reference[2] == tracks[-1][2]
 
 
 def test_it_is_shown_whole_with_few_points() -> None:
