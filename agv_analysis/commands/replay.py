@@ -12,7 +12,7 @@ from agv_analysis.commands import needs_ros, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
-    from agv_analysis.runtime.replay import Comparison, Difference
+    from agv_analysis.runtime.edge_comparison import Comparison, Difference
     from agv_analysis.scenario import Scenario
 
 
@@ -47,8 +47,9 @@ def command(
       agv-ncs replay bags/first --outages outages.csv
     """
     from agv_analysis.recordings.recording import read_run
-    from agv_analysis.runtime.replay import compare as compare_run
-    from agv_analysis.runtime.replay import with_settings, write_outages
+    from agv_analysis.runtime.edge_comparison import compare as compare_run
+    from agv_analysis.runtime.edge_comparison import with_settings
+    from agv_analysis.runtime.recorded_outages import write_outages
     from agv_cloud.parameters import PATH
     from agv_ros.errors import UserError
 
@@ -98,7 +99,8 @@ def _play(
 ) -> None:  # fmt: skip
     runner = _runner()
     from agv_analysis.commands.progress import step_bar
-    from agv_analysis.runtime.replay import compare_answers, on_steps, read_inputs
+    from agv_analysis.runtime.edge_comparison import compare_answers
+    from agv_analysis.runtime.edge_inputs import aligned_answers, read_inputs
     from agv_analysis.runtime.replay_node import Pace
 
     inputs = read_inputs(Path(run.source), scenario.grid, namespace)
@@ -113,7 +115,7 @@ def _play(
     if failures:
         raise click.ClickException("; ".join(failures))
     if compare:
-        _say(compare_answers(*on_steps(run, inputs, errors, commands)), json_file)
+        _say(compare_answers(*aligned_answers(run, inputs, errors, commands)), json_file)
 
 
 def _say(comparison: Comparison, json_file: Path | None) -> None:
@@ -126,7 +128,7 @@ def _say(comparison: Comparison, json_file: Path | None) -> None:
 
 def _drive_again(run: Run, scenario: Scenario, ros: bool, json_file: Path | None) -> None:
     from agv_analysis.report.table import print_side_by_side
-    from agv_analysis.runtime.replay import with_outages_of
+    from agv_analysis.runtime.recorded_outages import with_outages_of
     from agv_analysis.simulation.single import simulate
     from agv_analysis.stability.analysis import analyse
 

@@ -14,8 +14,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
 from agv_analysis.bags.writer import REPLAY_OF
+from agv_analysis.runtime.edge_inputs import EdgeInputs, SlotInput
 from agv_analysis.runtime.recorder_node import TOPICS, RecorderNode
-from agv_analysis.runtime.replay import EdgeInputs, Input
 from agv_ros.codec import decode_command, decode_error, encode_clock
 from agv_ros.messages import Command, TrackingError
 from agv_ros.node import LOOP_QOS, LoopNode
@@ -183,7 +183,7 @@ class ReplayNode(LoopNode[LoopParameters]):
         if self.k == len(self._slots) and not self._unanswered:
             self.finished = True
 
-    def _passed_ns(self, slot: Input) -> int:
+    def _passed_ns(self, slot: SlotInput) -> int:
         """When the slot is due, after the first one [ns]."""
         return round((slot.stamp_ns - self._slots[0].stamp_ns) / self._pace.rate)
 
@@ -196,13 +196,13 @@ class ReplayNode(LoopNode[LoopParameters]):
         self.report_every_second(now.stamp_ns)
         self._send(now)
         if self.recorder is not None:
-            for topic, data in now.beyond:
+            for topic, data in now.agv_side:
                 self.recorder.record(topic, data)
         if now.is_answered and (self._pace.lockstep or not self._is_connected):
             self._waits_for = now.k
         self.k += 1
 
-    def _send(self, slot: Input) -> None:
+    def _send(self, slot: SlotInput) -> None:
         self._sent = time.monotonic()
         self._clock_out.publish(encode_clock(slot.stamp_ns))
         if slot.pose is not None:

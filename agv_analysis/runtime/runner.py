@@ -17,9 +17,9 @@ from rclpy.executors import Executor
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
+from agv_analysis.runtime.edge_inputs import EdgeInputs
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.runtime.recorder_node import RecorderNode
-from agv_analysis.runtime.replay import EdgeInputs
 from agv_analysis.runtime.replay_node import Pace, ReplayNode, ReplayRecorder
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode

@@ -1,12 +1,10 @@
-"""Recordings played again: what the edge would answer, and outages for other runs."""
+"""Recordings played again to the edge's nodes, and driven again, by the command."""
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import itertools
 import json
-import math
 import shutil
 import subprocess
 import time
@@ -21,21 +19,9 @@ import yaml
 from agv_analysis.bags import read_bag
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
-from agv_analysis.runtime.replay import (
-    compare,
-    compare_answers,
-    inputs_of,
-    on_steps,
-    read_inputs,
-    with_outages_of,
-    with_settings,
-    write_outages,
-)
-from agv_analysis.scenario import SCHEMAS
-from agv_analysis.simulation.single import simulate
-from agv_plant.channels.trace import load_trace
+from agv_analysis.runtime.edge_comparison import compare, compare_answers
+from agv_analysis.runtime.edge_inputs import aligned_answers, inputs_of, read_inputs
 from agv_ros.codec import encode_clock, stamp_of
-from agv_ros.errors import UserError
 from agv_ros.message_sync import MessageSync
 from agv_ros.messages import DELIVERED, Slot, StampedPose
 from agv_ros.stamps import Grid
@@ -47,140 +33,6 @@ REPOSITORY = Path(__file__).parents[3]
 SAMPLE = REPOSITORY / "bags/sample"
 QOS = REPOSITORY / "config/rosbag2_qos.yaml"
 AgvNcs = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture(scope="module")
-def sample() -> Run:
-    return read_run(SAMPLE)
-
-
-def without(run: Run, *rows: int) -> Run:
-    """The run with some of its steps missing."""
-    names = ("k", "pose", "reference", "error", "command", "n_ul", "lost", "downlink_lost")
-    return dataclasses.replace(run, **{name: np.delete(getattr(run, name), rows, axis=0) for name in names})
-
-
-# -- compare -----------------------------------------------------------------------------------------------------------
-
-
-def test_an_unchanged_edge_answers_as_it_did(sample: Run) -> None:
-    comparison = compare(sample, sample.scenario)
-    assert not comparison.differs
-    assert comparison.error.compared == comparison.command.compared == comparison.steps == len(sample)
-    assert max(comparison.error.largest, comparison.command.largest) < 1e-12
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("controller.kx=250.0", "controller.v_max=6.0", "relay.uplink.model=burst", "relay.uplink.n=14"),
-        ("relay.uplink.model=gilbert_elliott", "relay.uplink.p=0.1", "relay.uplink.r=0.2",
-         "relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "error_detector.track=eight"),
-        ("plant.integration=arc", "plant.initial_pose=[0.0, 0.0, 20.0]"),
-    ],
-)  # fmt: skip
-def test_the_nodes_answers_follow_from_poses_and_slots(settings: tuple[str, ...], drive: Drive) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    run = drive("plant.duration=2.0", *settings)
-    comparison = compare(run, run.scenario)
-    assert not comparison.differs, comparison
-    assert comparison.command.compared == len(run) == 400
-
-
-def test_another_gain_differs_by_its_share_of_the_command(sample: Run) -> None:
-    """v = v_r cos(theta_e) + K_x x_e is linear in K_x."""
-    assert sample.scenario.controller.v_max == math.inf
-    gain = sample.scenario.controller.kx
-    comparison = compare(sample, with_settings(sample.scenario, [f"controller.kx={gain + 2.0}"]))
-    expected = np.abs(2.0 * sample.error[:, 0])
-    assert comparison.error.first is None
-    assert comparison.command.first == 0
-    assert comparison.command.first_size == pytest.approx(expected[0], abs=1e-12)
-    assert comparison.command.largest == pytest.approx(expected.max(), abs=1e-12)
-    assert comparison.command.largest_at == np.argmax(expected)
-
-
-def test_another_reference_differs_in_the_error(sample: Run) -> None:
-    """A reference that begins 0.25 m further on along the heading of the AGV."""
-    start = sample.scenario.error_detector.track_start
-    moved = [start[0], start[1] + 0.25, start[2]]
-    comparison = compare(sample, with_settings(sample.scenario, [f"error_detector.track_start={moved}"]))
-    assert comparison.error.first == 0
-    assert comparison.error.first_size == pytest.approx(0.25, abs=1e-9)
-
-
-def test_the_first_difference_is_found(sample: Run) -> None:
-    command = sample.command.copy()
-    command[700:, 1] += 2e-9 * np.maximum(1.0, np.abs(command[700:]).max(axis=1))
-    command[300, 0] += 1e-10
-    comparison = compare(dataclasses.replace(sample, command=command), sample.scenario)
-    assert (comparison.error.first, comparison.command.first) == (None, 700)
-
-
-def test_an_answer_that_is_no_number_differs(sample: Run) -> None:
-    pose = sample.pose.copy()
-    pose[~sample.lost & (sample.k == 100)] = np.nan
-    comparison = compare(dataclasses.replace(sample, pose=pose), sample.scenario)
-    assert comparison.differs
-    assert comparison.command.first_size == math.inf
-    assert json.loads(json.dumps(comparison.to_json(), allow_nan=False))["command"]["first_size"] is None
-
-
-def test_steps_without_the_held_pose_are_left_out(sample: Run) -> None:
-    row = int(np.flatnonzero(sample.lost)[0]) - 1  # the pose that is held during the first outage
-    outage = int(np.flatnonzero(~sample.lost[row + 1 :])[0])
-    comparison = compare(without(sample, row), sample.scenario)
-    assert not comparison.differs
-    assert (comparison.steps, comparison.error.compared) == (len(sample) - 1, len(sample) - 1 - outage)
-
-
-def test_nothing_to_compare_is_said(sample: Run) -> None:
-    silent = dataclasses.replace(sample, command=np.full_like(sample.command, np.nan))
-    with pytest.raises(UserError, match="nothing to compare, no step has both edge/cmd_vel"):
-        compare(silent, sample.scenario)
-
-
-def test_the_grid_is_the_recording_s(sample: Run) -> None:
-    with pytest.raises(UserError, match="ts and start_time are those of the recording"):
-        with_settings(sample.scenario, [f"{node}.ts=0.01" for node in SCHEMAS])
-
-
-# -- outages -----------------------------------------------------------------------------------------------------------
-
-
-def test_outages_of_a_recording_are_read_back(sample: Run, tmp_path: Path) -> None:
-    assert write_outages(tmp_path / "lost.csv", sample) == sample.lost.sum() > 0
-    assert load_trace(str(tmp_path / "lost.csv")) == tuple(sample.lost.tolist())
-
-
-def test_recorded_outages_drive_a_run_with_other_gains(sample: Run, tmp_path: Path, drive: Drive) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    write_outages(tmp_path / "lost.csv", sample)
-    trace = ("relay.uplink.model=trace", f"relay.uplink.trace_file={tmp_path / 'lost.csv'}")
-    run = drive("plant.duration=5.0", "controller.kx=5.0", *trace)
-    assert (run.lost == sample.lost[: len(run)]).all()
-    assert np.abs(simulate(run.scenario).pose - run.pose).max() < 1e-9
-
-
-def test_the_downlink_s_outages(tmp_path: Path, drive: Drive) -> None:
-    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
-    run = drive("plant.duration=0.5", "relay.downlink.model=burst", "relay.downlink.n=3")
-    write_outages(tmp_path / "lost.csv", run, downlink=True)
-    assert load_trace(str(tmp_path / "lost.csv")) == (False, True, True, True) * 25
-
-
-def test_missing_slots_are_refused(sample: Run, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="2 slots of edge/slot are missing"):
-        write_outages(tmp_path / "lost.csv", without(sample, 5, 9))
-    assert not (tmp_path / "lost.csv").exists()
-
-
-def test_a_path_that_cannot_be_written(sample: Run, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="cannot be written"):
-        write_outages(tmp_path, sample)
-
-
-# -- the command -------------------------------------------------------------------------------------------------------
 
 
 def test_the_command_says_whether_the_edge_changed(agv_ncs: AgvNcs, tmp_path: Path) -> None:
@@ -198,15 +50,6 @@ def test_the_command_s_errors_are_one_line(agv_ncs: AgvNcs, tmp_path: Path) -> N
     status, said = agv_ncs("replay", tmp_path / "none", "--compare")
     assert status == 1
     assert "Traceback" not in said
-
-
-@pytest.mark.parametrize("policy", ["align", "predict"])
-def test_an_edge_with_a_staleness_policy_gives_the_same_answers_again(drive: Drive, policy: str) -> None:
-    run = drive(f"error_detector.policy={policy}", "plant.duration=2.0", "plant.speed_scale=1.05", config="outages")
-    assert run.n_ul.max() > 3
-    found = compare(run, run.scenario)
-    assert found.error.first is None
-    assert found.command.first is None
 
 
 # -- on DDS ------------------------------------------------------------------------------------------------------------
@@ -275,7 +118,7 @@ def test_policies_and_namespaces_on_dds(drive: Drive, policy: str, tmp_path: Pat
     inputs = read_inputs(Path(run.source), run.scenario.grid)._replace(namespace="robot7")
     outcome, errors, commands = replay_in_process(run.scenario, inputs, Pace(lockstep=True), None, lambda _: None)
     assert (outcome.failure, outcome.steps) == ("", 400)
-    assert not compare_answers(*on_steps(run, inputs, errors, commands)).differs
+    assert not compare_answers(*aligned_answers(run, inputs, errors, commands)).differs
 
 
 def test_a_recording_that_begins_in_an_outage(sample: Run) -> None:
@@ -294,7 +137,7 @@ def test_a_recording_that_begins_in_an_outage(sample: Run) -> None:
     assert [slot.is_answered for slot in inputs.slots] == [False] * outage + [True] * (300 - outage)
     outcome, errors, commands = replay_in_process(sample.scenario, inputs, Pace(lockstep=True), None, lambda _: None)
     assert outcome.failure == ""
-    comparison = compare_answers(*on_steps(sample, inputs, errors, commands))
+    comparison = compare_answers(*aligned_answers(sample, inputs, errors, commands))
     assert not comparison.differs
     assert comparison.error.compared == 300 - outage < 300
 
@@ -434,12 +277,6 @@ def test_ros2_bag_play_itself_is_answered_as_recorded(edge: Edge, start: Start) 
 # -- driven again ------------------------------------------------------------------------------------------------------
 
 
-def test_the_recorded_outages_and_gains_give_the_recorded_run(sample: Run, tmp_path: Path) -> None:
-    again = simulate(with_outages_of(sample, sample.scenario, tmp_path))
-    assert (again.lost == sample.lost).all()
-    assert np.abs(again.pose - sample.pose).max() < 1e-9
-
-
 @pytest.mark.parametrize("ros", [(), ("--ros",)])
 def test_two_runs_in_one_table(agv_ncs: AgvNcs, tmp_path: Path, ros: tuple[str, ...]) -> None:
     if ros:
@@ -454,11 +291,6 @@ def test_two_runs_in_one_table(agv_ncs: AgvNcs, tmp_path: Path, ros: tuple[str, 
     for same in ("steps", "loss_rate", "outage_lengths", "n_ul_max"):
         assert found["recorded"][same] == found["again"][same]
     assert found["recorded"]["settle_2pct_steps"] != found["again"]["settle_2pct_steps"]
-
-
-def test_a_recording_without_its_beginning_is_not_driven_again(sample: Run, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="begins with step 3"):
-        with_outages_of(without(sample, 0, 1, 2), sample.scenario, tmp_path)
 
 
 @pytest.mark.parametrize(
