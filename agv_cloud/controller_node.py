@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_cloud.control.command import command, control_law
-from agv_cloud.control.plan import planned_commands
+from agv_cloud.control.command_plan import planned_commands
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.parameters import ControllerParameters
 from agv_ros.codec import decode_error, encode_command, encode_twist

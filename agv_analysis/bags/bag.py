@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.batch import Batch
+from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.checks import check_times
-from agv_analysis.bags.errors import BagError, UndecodableError
 from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.message_batch import Batch
+from agv_analysis.bags.message_table import Table
 from agv_analysis.bags.records import TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
 from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import LARGE, Storage
-from agv_analysis.bags.table import Table
 from agv_analysis.bags.type_hash import contradicts
 
 _THREADS = 2

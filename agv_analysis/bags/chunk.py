@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.bags.batch import Bytes, Ints, numbers_at
+from agv_analysis.bags.bag_errors import DamagedError
 from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.chunk_index import survey
 from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
-from agv_analysis.bags.errors import DamagedError
+from agv_analysis.bags.message_batch import Bytes, Ints, numbers_at
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Index, Read, has_shape, is_known
 
 _HEAD = 8 + 8 + 8 + 4

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.bags.batch import Bytes, Ints, number
+from agv_analysis.bags.message_batch import Bytes, Ints, number
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD
 from agv_analysis.compiled import HAS_NUMBA, compiled
 

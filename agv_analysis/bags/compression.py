@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from agv_analysis.bags.errors import DamagedError
+from agv_analysis.bags.bag_errors import DamagedError
 
 MAX_CHUNK = 2**30
 """Most bytes that one chunk may inflate to: a thousand times what ROS 2 writes."""

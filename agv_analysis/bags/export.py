@@ -13,7 +13,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from agv_analysis.bags.bag import Bag
-from agv_analysis.bags.errors import BagError
+from agv_analysis.bags.bag_errors import BagError
 
 _ROWS = 8192
 """Rows that are turned into text at a time."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.errors import UndecodableError
+from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.schema import STRING, Member, Struct
 
 LEAD = 16

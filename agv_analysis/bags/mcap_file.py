@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.bags.batch import Batch, Bytes
+from agv_analysis.bags.bag_errors import BagError, DamagedError
 from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.chunk import (
     Content,
@@ -40,9 +40,9 @@ from agv_analysis.bags.chunk import (
     walk,
 )
 from agv_analysis.bags.definitions import Definitions
-from agv_analysis.bags.errors import BagError, DamagedError
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.layout import LEAD
+from agv_analysis.bags.message_batch import Batch, Bytes
 from agv_analysis.bags.records import (
     ATTACHMENT,
     CHANNEL,

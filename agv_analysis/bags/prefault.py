@@ -11,7 +11,7 @@ import mmap
 import sys
 from concurrent.futures import Executor
 
-from agv_analysis.bags.batch import Bytes
+from agv_analysis.bags.message_batch import Bytes
 
 _WINDOW = 2**24
 """Bytes that are asked for at a time."""

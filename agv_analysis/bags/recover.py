@@ -14,9 +14,9 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from agv_analysis.bags.bag import Progress
-from agv_analysis.bags.batch import Batch, Layouts
-from agv_analysis.bags.errors import BagError, UndecodableError
+from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.message_batch import Batch, Layouts
 from agv_analysis.bags.records import TYPE_HASH, Channel
 from agv_analysis.bags.rosbag2 import METADATA, locate, open_files
 from agv_analysis.bags.schema import parse_schema

@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from agv_analysis.bags.errors import BagError
+from agv_analysis.bags.bag_errors import BagError
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.mcap_file import McapFile
 from agv_analysis.bags.storage import Storage

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.bags.batch import Batch
+from agv_analysis.bags.bag_errors import BagError, DamagedError
 from agv_analysis.bags.compression import declared_size, inflate_start
-from agv_analysis.bags.errors import BagError, DamagedError
 from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.message_batch import Batch
 from agv_analysis.bags.records import TYPE_HASH, Attachment, Channel, Schema
 from agv_analysis.bags.storage import IsWanted
 

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from agv_analysis.bags.errors import UndecodableError
+from agv_analysis.bags.bag_errors import UndecodableError
 
 STRING = "string"
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agv_analysis.bags.bag_errors import BagError, DamagedError
 from agv_analysis.bags.compression import MAX_CHUNK
-from agv_analysis.bags.errors import BagError, DamagedError
 from agv_analysis.bags.records import MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, Index, has_shape, is_known
 
 _AHEAD = 2**18

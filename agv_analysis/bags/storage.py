@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Protocol
 
-from agv_analysis.bags.batch import Batch
 from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.message_batch import Batch
 from agv_analysis.bags.records import Attachment, Channel, Schema
 
 LARGE = 2**24

@@ -66,7 +66,7 @@ def report_on(analysis: Observations, report: Path | None, figures: Path | None)
         write_report(analysis, report)
         click.echo(f"report:  {report}")
     if figures is not None:
-        from agv_analysis.report.figures import draw_figures
+        from agv_analysis.report.matplotlib_figures import draw_figures
         from agv_analysis.report.panels import panels
 
         draw_figures(panels(analysis), figures)

@@ -40,7 +40,7 @@ def command(
     """
     from agv_analysis.recordings.other_robots import read_robot_run, read_topics
     from agv_analysis.recordings.recording import read_run
-    from agv_analysis.report.picture import draw
+    from agv_analysis.report.overview import draw
     from agv_analysis.report.table import print_table
     from agv_analysis.stability.analysis import analyse, observe
 

@@ -40,7 +40,7 @@ def info(bag: Path, json_file: Path | None) -> None:
       agv-ncs bag info someone_elses.mcap --json info.json
     """
     from agv_analysis.bags import read_bag
-    from agv_analysis.bags.summary import describe
+    from agv_analysis.bags.bag_summary import describe
 
     with _bar(bag, "reading") as progress:
         content = read_bag(bag, progress=progress)

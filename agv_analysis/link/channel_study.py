@@ -175,7 +175,7 @@ def draw(path: Path, found: ChannelStudy) -> None:
     """Draw the age slot by slot, and its distribution beside the closed form. Raises UserError if that fails."""
     from matplotlib.figure import Figure
 
-    from agv_analysis.report.picture import DRIVEN, LOST
+    from agv_analysis.report.overview import DRIVEN, LOST
 
     figure = Figure(figsize=(11.0, 4.0), layout="constrained")
     course, shares = figure.subplots(1, 2)

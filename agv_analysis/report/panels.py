@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.metrics.convergence import TOLERANCE, body_errors, wrapped
-from agv_analysis.report.picture import SMALLEST, within
+from agv_analysis.report.overview import SMALLEST, within
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import lifted, paper
 from agv_analysis.stability.analysis import Analysis, Observations, paper_inputs

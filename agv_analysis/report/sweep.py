@@ -109,7 +109,7 @@ def draw_sweep_figures(sweep: Sweep, rows: Rows, folder: Path) -> None:
     """Draw the probability of instability to `folder`, as SVG and PDF. Raises UserError if that is not possible."""
     import matplotlib as mpl
 
-    from agv_analysis.report.figures import STYLE
+    from agv_analysis.report.matplotlib_figures import STYLE
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

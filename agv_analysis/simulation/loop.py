@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.metrics.convergence import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_cloud.control.command import command
-from agv_cloud.control.plan import next_error
+from agv_cloud.control.command_plan import next_error
 from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.staleness.estimate import staleness_policy
 from agv_cloud.tracking_error import tracking_error

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from agv_analysis.bags.batch import Batch
-from agv_analysis.bags.errors import UndecodableError
+from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.layout import LEAD, trace
+from agv_analysis.bags.message_batch import Batch
+from agv_analysis.bags.message_table import Table
 from agv_analysis.bags.schema import parse_schema
-from agv_analysis.bags.table import Table
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = sorted(

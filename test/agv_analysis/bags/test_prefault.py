@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis.bags.batch import Bytes
+from agv_analysis.bags.message_batch import Bytes
 from agv_analysis.bags.prefault import PagesAhead
 
 MIB = 2**20

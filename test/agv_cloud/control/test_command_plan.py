@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
-from agv_cloud.control.plan import next_error
+from agv_cloud.control.command_plan import next_error
 from agv_cloud.tracking_error import tracking_error
 from agv_plant.downlink_policy import BUFFER, share_of_command
 from agv_plant.vehicle.unicycle import STEPS

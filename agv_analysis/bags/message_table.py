@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.batch import Batch, Bytes, Group, Ints, Layouts, values_at
+from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.compiled_decoder import MAX_LAYOUTS, Run, compiled_place, recipes
-from agv_analysis.bags.errors import UndecodableError
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
+from agv_analysis.bags.message_batch import Batch, Bytes, Group, Ints, Layouts, values_at
 from agv_analysis.bags.prefault import PagesAhead
 from agv_analysis.bags.schema import STRING, Struct
 

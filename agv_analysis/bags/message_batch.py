@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.errors import UndecodableError
+from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.layout import LEAD, Layout, trace
 from agv_analysis.bags.schema import Struct
 
