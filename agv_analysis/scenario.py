@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, NamedTuple
 
+from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.parameters import ControllerParameters, ErrorDetectorParameters
+from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.parameters import PlantParameters, RelayParameters
+from agv_plant.vehicle.registry import VEHICLES
 from agv_ros.parameters import ParameterError, as_dict
 from agv_ros.params_file import parse_sections, read_sections, resolve
+from agv_ros.parts import Registry
 from agv_ros.ros_yaml import dump
 from agv_ros.stamps import Grid
 
@@ -21,6 +25,28 @@ SCHEMAS: dict[str, type] = {
     "controller": ControllerParameters,
 }
 """The loop's nodes by name, each with the schema of its parameters."""
+
+
+class PartChoice(NamedTuple):
+    """A node's parameter by which one of several parts is chosen, each with parameters of its own."""
+
+    parameter: str
+    registry: Registry
+    unprefixed: str = ""
+    """The part whose parameters stand without its name before them, if there is one."""
+
+    def names(self, part: str) -> tuple[str, ...]:
+        """Names of a part's parameters, as the node has them."""
+        prefix = "" if part == self.unprefixed else f"{part}."
+        return tuple(prefix + known.name for known in self.registry.find(part).parameters)
+
+
+PART_CHOICES = {
+    "plant": PartChoice("vehicle", VEHICLES),
+    "error_detector": PartChoice("policy", STALENESS_POLICIES),
+    "controller": PartChoice("law", CONTROL_LAWS, KANAYAMA),
+}
+"""The parts that are chosen by name, by their node."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +75,19 @@ class Scenario:
         """
         return Scenario(**resolve(SCHEMAS, self._sections(), settings, name))
 
-    def to_yaml(self) -> str:
-        """The whole scenario as a ROS 2 params file, with every default written out."""
-        return dump({node: {"ros__parameters": values} for node, values in self._sections().items()})
+    def to_yaml(self, of_all_parts: bool = False) -> str:
+        """The whole scenario as a ROS 2 params file, with every default written out.
+
+        Of vehicles, control laws and policies only the parameters of the chosen ones are in it, or those `of_all_parts`
+        that are installed here, which no machine can read that has others.
+        """
+        sections = self._sections()
+        if not of_all_parts:
+            for node, choice in PART_CHOICES.items():
+                others = set(choice.registry.usable()) - {sections[node][choice.parameter]}
+                for name in (name for part in others for name in choice.names(part)):
+                    sections[node].pop(name, None)
+        return dump({node: {"ros__parameters": values} for node, values in sections.items()})
 
     def _sections(self) -> dict[str, dict[str, Any]]:
         return {node: _plain(as_dict(getattr(self, node))) for node in SCHEMAS}

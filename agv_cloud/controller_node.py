@@ -19,6 +19,7 @@ from agv_ros.executor import run_node
 from agv_ros.message_types import TWIST_STAMPED
 from agv_ros.messages import FRAME_AGV, Command, TrackingError
 from agv_ros.node import LoopNode
+from agv_ros.parts import complaint
 from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
 from agv_ros.stamps import NS_PER_S
 from agv_ros.substitution import replaced
@@ -63,7 +64,7 @@ class ControllerNode(LoopNode[ControllerParameters]):
                 settings.look_ahead, settings.v_max,
             )  # fmt: skip
         except Exception as problem:  # another package's law, in which anything can go wrong
-            self._refuse(f"raises {type(problem).__name__}: {problem}", error.stamp_ns)
+            self._refuse(complaint(problem), error.stamp_ns)
             return
         self._send(Command(error.stamp_ns, v, w))
 
@@ -78,7 +79,7 @@ class ControllerNode(LoopNode[ControllerParameters]):
 
     def _refuse(self, what: str, stamp_ns: int) -> None:
         """End the run: the control law cannot go on."""
-        where = CONTROL_LAWS.where(self.settings.law)
+        where = CONTROL_LAWS.find(self.settings.law).where
         self.fail(f"{where} {what}, {(stamp_ns - self.grid.start_ns) / NS_PER_S:.6g} s after the start of the run")
 
     def _send(self, command: Command) -> None:
@@ -117,7 +118,7 @@ class ControllerNode(LoopNode[ControllerParameters]):
                 settings.look_ahead, settings.v_max, settings.integration == "arc", self._command,
             )  # fmt: skip
         except Exception as problem:  # as above
-            self._refuse(f"raises {type(problem).__name__}: {problem}", stamp_ns)
+            self._refuse(complaint(problem), stamp_ns)
             return
         self._send(Command(stamp_ns, *commands[0]))
         plan = SpeedsAhead(stamp_ns, tuple(commands))

@@ -15,12 +15,8 @@ from agv_cloud.staleness.estimate import PoseEstimator
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_cloud.step import EdgeStep
 from agv_cloud.tracking_error import tracking_error
-from agv_ros.errors import UserError
+from agv_ros.parts import PartError, complaint
 from agv_ros.pose import Pose
-
-
-class PolicyError(UserError):
-    """A staleness policy that raised; the text names it, what it raised and the step."""
 
 
 class Detection(NamedTuple):
@@ -62,15 +58,15 @@ class ErrorDetection:
             self.reference.restart()
 
     def detect(self, step: EdgeStep) -> Detection:
-        """The error of a step. Raises PolicyError if the staleness policy raises."""
+        """The error of a step. Raises PartError if the staleness policy raises."""
         k, received = step.k, Pose(step.pose.x, step.pose.y, step.pose.theta)
         if isinstance(self.reference, PathReference):
             self.reference.begin(k)
         try:
             held, target = self.estimator.at(k, step.taken, received, lambda at: self._reference_at(at, received))
         except Exception as problem:  # another package's policy, in which anything can go wrong
-            where = STALENESS_POLICIES.where(self.settings.policy)
-            raise PolicyError(f"{where} raises {type(problem).__name__}: {problem}, at step {k}") from problem
+            where = STALENESS_POLICIES.find(self.settings.policy).where
+            raise PartError(f"{where} {complaint(problem)}, at step {k}") from problem
         ahead = self._reference_at(k, held)
         now = ahead if self.settings.steps_ahead == 0 else self.reference[k] or ahead
         return Detection(tracking_error(*target, *held), ahead, now, held)

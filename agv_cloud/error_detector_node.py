@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
-from agv_cloud.error_detection import ErrorDetection, PolicyError
+from agv_cloud.error_detection import ErrorDetection
 from agv_cloud.parameters import PATH, ErrorDetectorParameters
 from agv_cloud.reference.path_reference import PathReference
 from agv_cloud.reference.path_track import PathError, PathTrack, Point
@@ -48,6 +48,7 @@ from agv_ros.messages import (
     quaternion_of_yaw,
 )
 from agv_ros.node import LoopNode
+from agv_ros.parts import PartError
 from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
 from agv_ros.stamps import NS_PER_S
 from agv_ros.transforms import TransformBroadcaster
@@ -239,7 +240,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         """Publish the error of a step, and what goes with it."""
         try:
             found = self._detection.detect(step)
-        except PolicyError as error:
+        except PartError as error:
             self.fail(str(error))
             return
         stamp_ns, prefix, reference = self.grid.stamp(step.k), self.settings.frame_prefix, found.reference

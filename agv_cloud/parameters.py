@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
 
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
+from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.reference.tracks import TRACKS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES
-from agv_ros.parameters import LoopParameters, ParameterError, merged, parameter
-from agv_ros.parts import Part, PartError, checked, field_of, schema_of
+from agv_ros.parameters import LoopParameters, ParameterError, merged, parameter, parameters_of
+from agv_ros.parts import field_of, refuse_taken, schema_of, try_part, values_of
+from agv_ros.pose import Pose
 
 TRIGGERS = ("slot", "timer")
 
@@ -21,16 +22,9 @@ CSV, PATH = "csv", "path"
 """Tracks that come from elsewhere: a file, or a topic."""
 
 
-_PolicyParameters = schema_of("PolicyParameters", STALENESS_POLICIES.usable(), globals())
-_LawParameters = schema_of(
-    "LawParameters", {name: law for name, law in CONTROL_LAWS.usable().items() if name != KANAYAMA}, globals()
-)
-_KANAYAMA = CONTROL_LAWS.find(KANAYAMA)
-
-
 @dataclass(frozen=True)
-class ErrorDetectorParameters(LoopParameters):
-    """Parameters of the node `error_detector`."""
+class _OwnErrorDetectorParameters(LoopParameters):
+    """Parameters of the node `error_detector` but for those of policies."""
 
     track: str = parameter(
         "paper",
@@ -55,6 +49,7 @@ class ErrorDetectorParameters(LoopParameters):
         "what an outdated pose is compared with; hold: the reference of now, align: that of its instant, predict: it "
         "is moved on by the plant's model under the commands sent since, and compared with the reference of now",
         choices=STALENESS_POLICIES.names(),
+        remedy=STALENESS_POLICIES.remedy,
     )
     integration: str = parameter(
         "euler", "predict: how the plant's model integrates one period, as plant.integration", choices=tuple(STEPS)
@@ -76,12 +71,29 @@ class ErrorDetectorParameters(LoopParameters):
         "pose", "type of edge/pose; pose: geometry_msgs/PoseStamped, odometry: nav_msgs/Odometry", choices=POSE_TYPES
     )
 
-    of_policies: Any = merged(_PolicyParameters)
+
+_TAKEN_AT_ERROR_DETECTOR = tuple(parameters_of(_OwnErrorDetectorParameters))
+_PolicyParameters = schema_of(
+    "PolicyParameters", STALENESS_POLICIES.usable(), _TAKEN_AT_ERROR_DETECTOR, globals()
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ErrorDetectorParameters(_OwnErrorDetectorParameters):
+    """Parameters of the node `error_detector`."""
+
+    of_policies: Any = merged(_PolicyParameters, STALENESS_POLICIES.refusal)
     """Parameters of policies that have some, `policy.parameter`."""
 
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
-        STALENESS_POLICIES.find(self.policy)
+        policy = STALENESS_POLICIES.find(self.policy)
+        refuse_taken(policy, _TAKEN_AT_ERROR_DETECTOR)
+        number, arc = STALENESS_POLICIES.names().index(self.policy), self.integration == "arc"
+        for held, target, reference, v, w in _STALE_TRIALS:
+            try_part(
+                policy, STALENESS_POLICIES.call, number, held, target, reference, v, w, self.ts, arc, self.policy_values
+            )
         if self.track == CSV and not self.track_file:
             raise ParameterError("error_detector.track is csv, but error_detector.track_file is empty: name a file")
         if self.lap_time < 16.0 * self.ts:
@@ -92,13 +104,27 @@ class ErrorDetectorParameters(LoopParameters):
     @property
     def policy_values(self) -> tuple[float, ...]:
         """The parameters of the chosen policy, in the order of its signature."""
-        own = getattr(self.of_policies, self.policy, None)
-        return () if own is None else dataclasses.astuple(own)
+        return values_of(STALENESS_POLICIES.find(self.policy), self.of_policies)
+
+    @property
+    def hears_commands(self) -> bool:
+        """Does the chosen policy have to know the commands that were sent?"""
+        return bool({"v", "w"} & STALENESS_POLICIES.find(self.policy).arguments)
+
+
+_STALE_TRIALS = (
+    (Pose(0.0, 0.0, 0.0), Pose(0.0, 0.0, 0.0), ReferencePoint(0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 0.0),
+    (Pose(0.1, -0.2, 0.3), Pose(0.2, 0.1, 0.2), ReferencePoint(0.3, 0.2, 0.1, 0.5, 0.1), 0.6, -0.1),
+)
+"""Poses and speeds with which a policy must be able to deal."""
+
+
+_KANAYAMA = CONTROL_LAWS.own_part(KANAYAMA)
 
 
 @dataclass(frozen=True)
-class ControllerParameters(LoopParameters):
-    """Parameters of the node `controller`."""
+class _OwnControllerParameters(LoopParameters):
+    """Parameters of the node `controller` but for those of laws with names of their own before their gains."""
 
     law: str = parameter(
         KANAYAMA,
@@ -106,12 +132,11 @@ class ControllerParameters(LoopParameters):
         "error, pure_pursuit: along the circle to the point that the reference reaches look_ahead later; the gains of "
         "others than kanayama have the law's name before them",
         choices=CONTROL_LAWS.names(),
+        remedy=CONTROL_LAWS.remedy,
     )
     kx: float = field_of(_KANAYAMA, "kx")
     ky: float = field_of(_KANAYAMA, "ky")
     ktheta: float = field_of(_KANAYAMA, "ktheta")
-    of_laws: Any = merged(_LawParameters)
-    """Gains of the other laws, `law.gain`."""
     integration: str = parameter(
         "euler", "how the model behind a plan integrates one period, as plant.integration", choices=tuple(STEPS)
     )
@@ -123,36 +148,40 @@ class ControllerParameters(LoopParameters):
     )
     v_max: float = parameter(math.inf, "limit on |v|, .inf: none", unit="m/s", above=0.0, high=math.inf, runtime=True)
 
+
+_TAKEN_AT_CONTROLLER = tuple(parameters_of(_OwnControllerParameters))
+_LawParameters = schema_of(
+    "LawParameters", {name: law for name, law in CONTROL_LAWS.usable().items() if name != KANAYAMA},
+    _TAKEN_AT_CONTROLLER, globals(),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ControllerParameters(_OwnControllerParameters):
+    """Parameters of the node `controller`."""
+
+    of_laws: Any = merged(_LawParameters, CONTROL_LAWS.refusal)
+    """Gains of other laws than kanayama, `law.gain`."""
+
     def __post_init__(self) -> None:
         """Check what no single bound can say: can the law be called?"""
         law = CONTROL_LAWS.find(self.law)
+        refuse_taken(law, _TAKEN_AT_CONTROLLER)
         if "look_ahead" in law.arguments and self.steps_ahead == 0:
             raise ParameterError(
-                f"{CONTROL_LAWS.where(self.law)} looks ahead, but look_ahead is {self.look_ahead:g}: set it to one "
-                "period ts at least, the same on all nodes"
+                f"{law.where} looks ahead, but look_ahead is {self.look_ahead:g}: set it to one period ts at least, "
+                "the same on all nodes"
             )
-        _try(law, self)
+        for trial in _TRIALS:
+            try_part(law, CONTROL_LAWS.call, *trial, law.memory, self.gains, self.ts, self.look_ahead)
 
     @property
     def gains(self) -> tuple[float, ...]:
         """The parameters of the chosen law, in the order of its signature."""
         if self.law == KANAYAMA:
             return self.kx, self.ky, self.ktheta
-        own = getattr(self.of_laws, self.law, None)
-        return () if own is None else dataclasses.astuple(own)
+        return values_of(CONTROL_LAWS.find(self.law), self.of_laws)
 
 
 _TRIALS = ((0.0, 0.0, 0.0, 1.0, 0.0), (0.1, -0.2, 0.3, 0.5, 0.1))
 """Errors [m, m, rad] and speeds of the reference [m/s, rad/s] with which a law must be able to deal."""
-
-
-def _try(law: Part, settings: ControllerParameters) -> None:
-    """Call a law once or twice. Raises PartError if it raises or if its command is no two finite numbers."""
-    where = CONTROL_LAWS.where(law.name)
-    for trial in _TRIALS:
-        arguments = (*trial, law.memory, settings.gains, settings.ts, settings.look_ahead)
-        found = checked(law, where, lambda: law.adapter(*arguments))  # noqa: B023  # called at once
-        if len(found) != 2 + len(law.memory):
-            raise PartError(f"{where} must return as many numbers for its memory as it begins with: {len(law.memory)}")
-        if not all(map(math.isfinite, found)):
-            raise PartError(f"{where} returns {found} for the error and reference speeds {trial}: must be finite")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Any
 from agv_plant.channels.coverage_hole import NO_HOLES
 from agv_plant.channels.coverage_hole import rows_of as holes
 from agv_plant.channels.position_dependent import EVERYWHERE, kind_of
-from agv_plant.channels.registry import SHARED, TRACE, known_models
+from agv_plant.channels.registry import CHANNELS, SHARED, TRACE
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.radio.schedule import Entry, parse_schedule
@@ -20,14 +19,12 @@ from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES, TWIST
 from agv_ros.parameters import LoopParameters, ParameterError, TwoDomains, group, merged, parameter, parameters_of
-from agv_ros.parts import Part, PartError, checked, schema_of
-
-_VehicleParameters = schema_of("ParametersOfVehicles", VEHICLES.usable(), globals())
+from agv_ros.parts import refuse_taken, schema_of, try_part, values_of
 
 
 @dataclass(frozen=True)
-class PlantParameters(LoopParameters):
-    """Parameters of the node `plant`."""
+class _OwnPlantParameters(LoopParameters):
+    """Parameters of the node `plant` but for those of vehicles."""
 
     initial_pose: tuple[float, float, float] = parameter(
         (0.0, 5.0, 1.5707963267948966), "X_c(0) = [x, y, theta] in frame map", unit="m, m, rad"
@@ -37,9 +34,8 @@ class PlantParameters(LoopParameters):
         "vehicle; unicycle: turns as it is told, the paper's, bicycle: steers its front wheel; what vehicles have of "
         "their own has their name before it",
         choices=VEHICLES.names(),
+        remedy=VEHICLES.remedy,
     )
-    of_vehicles: Any = merged(_VehicleParameters)
-    """Parameters of vehicles that have some, `vehicle.parameter`."""
     integration: str = parameter("euler", "how the plant integrates one period", choices=tuple(STEPS))
     clock: str = parameter(
         "lockstep",
@@ -98,17 +94,33 @@ class PlantParameters(LoopParameters):
         1, "seed of noise and slip; a sweep's seeds, and agv-ncs run --seed, set it with relay.seed", low=0, high=2**62
     )
 
+
+_TAKEN = tuple(parameters_of(_OwnPlantParameters))
+_VehicleParameters = schema_of("ParametersOfVehicles", VEHICLES.usable(), _TAKEN, globals())
+
+
+@dataclass(frozen=True)
+class PlantParameters(_OwnPlantParameters):
+    """Parameters of the node `plant`."""
+
+    of_vehicles: Any = merged(_VehicleParameters, VEHICLES.refusal)
+    """Parameters of vehicles that have some, `vehicle.parameter`."""
+
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
-        _try(VEHICLES.find(self.vehicle), self)
+        vehicle = VEHICLES.find(self.vehicle)
+        refuse_taken(vehicle, _TAKEN)
+        for x, y, theta, v, w in _TRIALS:
+            states = (0.0,) * len(vehicle.states)
+            arc = self.integration == "arc"
+            try_part(vehicle, VEHICLES.call, x, y, theta, states, v, w, v, w, self.ts, arc, self.vehicle_values)
         if self.downlink_policy == "buffer" and self.plan_steps == 0:
             raise ParameterError("plant.downlink_policy is buffer, but plan_steps is 0: set it, the same on all nodes")
 
     @property
     def vehicle_values(self) -> tuple[float, ...]:
         """The parameters of the chosen vehicle, in the order of its signature."""
-        own = getattr(self.of_vehicles, self.vehicle, None)
-        return () if own is None else dataclasses.astuple(own)
+        return values_of(VEHICLES.find(self.vehicle), self.of_vehicles)
 
     @property
     def policy_steps(self) -> float:
@@ -121,20 +133,15 @@ class PlantParameters(LoopParameters):
         return self.noise_xy > 0.0 or self.noise_theta > 0.0
 
 
-def _try(vehicle: Part, plant: PlantParameters) -> None:
-    """Drive a vehicle for one step. Raises PartError if it raises or if its state is not finite."""
-    where, states = VEHICLES.where(vehicle.name), (0.0,) * len(vehicle.states)
-    arguments = (0.0, 0.0, 0.5, states, 1.0, 0.1, 1.0, 0.1, plant.ts, plant.integration == "arc", plant.vehicle_values)
-    found = checked(vehicle, where, lambda: vehicle.adapter(*arguments))
-    if not all(map(math.isfinite, found)):
-        raise PartError(f"{where} returns {found} for a step at 1 m/s and 0.1 rad/s: must be finite")
+_TRIALS = ((0.0, 0.0, 0.5, 1.0, 0.1), (1.0, -2.0, 3.0, 0.0, 0.0))
+"""Poses in frame `map` [m, m, rad] and speeds [m/s, rad/s] with which a vehicle must be able to deal."""
 
 
 @dataclass(frozen=True)
 class ChannelParameters:
     """One direction of the radio channel."""
 
-    model: str = parameter("perfect", "channel model", choices=known_models())
+    model: str = parameter("perfect", "channel model", choices=CHANNELS.names(), remedy=CHANNELS.remedy)
     p: float = parameter(
         0.0,
         "bernoulli: loss probability; coverage_hole: the same outside of the holes; gilbert_elliott: probability of "

@@ -30,6 +30,7 @@ from agv_ros.executor import run_node
 from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.messages import FRAME_AGV, Command, InvalidMessageError, StampedPose
 from agv_ros.node import LoopNode
+from agv_ros.parts import complaint
 from agv_ros.pose import Pose
 from agv_ros.speeds_codec import decode_speeds
 from agv_ros.stamps import to_nanoseconds
@@ -143,8 +144,7 @@ class PlantNode(LoopNode[PlantParameters]):
         try:
             motion = self._move(self._motion, share * v, share * w, n_left, n_right, self._vehicle)
         except Exception as problem:  # another package's vehicle, in which anything can go wrong
-            where = VEHICLES.where(plant.vehicle)
-            self.fail(f"{where} raises {type(problem).__name__}: {problem}, at step {self.k}")
+            self.fail(f"{VEHICLES.find(plant.vehicle).where} {complaint(problem)}, at step {self.k}")
             return
         if not all(map(math.isfinite, motion[:3])):
             self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")

@@ -9,9 +9,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 from agv_ros.errors import UserError
@@ -38,6 +37,8 @@ class Parameter:
     choices: tuple[str, ...] = ()
     length: int | None = None
     runtime: bool = False
+    remedy: str = ""
+    """What to do where none of the choices is meant."""
 
     @property
     def _count(self) -> str:
@@ -77,7 +78,8 @@ class Parameter:
             if not isinstance(value, str):
                 raise ParameterError(f"{where} is a string, got {value!r}")
             if self.choices and value not in self.choices:
-                raise ParameterError(f"{where} must be {self.allowed}, got {value!r}")
+                remedy = f": {self.remedy}" if self.remedy else ""
+                raise ParameterError(f"{where} must be {self.allowed}, got {value!r}{remedy}")
         else:
             return self._check_array(where, value)
         return value
@@ -116,15 +118,17 @@ def parameter(
     choices: tuple[str, ...] = (),
     runtime: bool = False,
     any_length: bool = False,
+    remedy: str = "",
 ) -> T:
     """Dataclass field for one parameter.
 
     `low` and `high` are included, `above` is not; a double is finite unless `high` is inf. A `runtime` parameter can be
-    changed while the node runs. A tuple default makes a double_array of that length, or of any but 0.
+    changed while the node runs. A tuple default makes a double_array of that length, or of any but 0. `remedy` says
+    what to do where none of the `choices` is meant.
     """
     known = {
         "description": description, "unit": unit, "low": low, "high": high, "above": above, "choices": choices,
-        "runtime": runtime, "any_length": any_length,
+        "runtime": runtime, "any_length": any_length, "remedy": remedy,
     }  # fmt: skip
     return dataclasses.field(default=default, metadata={"parameter": known})
 
@@ -134,9 +138,12 @@ def group(schema: type[T]) -> T:
     return dataclasses.field(default_factory=schema, metadata={"group": schema})
 
 
-def merged(schema: type) -> Any:
-    """As `group`, but the names of the nested dataclass stay as they are."""
-    return dataclasses.field(default_factory=schema, metadata={"group": schema, "prefix": ""})
+def merged(schema: type, refusal: Callable[[str], str] = lambda _: "") -> Any:
+    """As `group`, but the names of the nested dataclass stay as they are.
+
+    `refusal` says of the first word of a dotted name why there is no such parameter, if it knows.
+    """
+    return dataclasses.field(default_factory=schema, metadata={"group": schema, "prefix": "", "refusal": refusal})
 
 
 def _prefix(field: dataclasses.Field[Any]) -> str:
@@ -147,19 +154,31 @@ def _prefix(field: dataclasses.Field[Any]) -> str:
 _KINDS = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double_array"}
 
 
-def parameters_of(schema: type) -> Mapping[str, Parameter]:
+class KnownParameters(dict[str, Parameter]):
+    """Parameters by their full (dotted) names, in the order of declaration; not to be changed."""
+
+    refusals: tuple[Callable[[str], str], ...] = ()
+
+    def refusal(self, name: str) -> str:
+        """Why there is no parameter called `name`, empty if it is not known."""
+        reasons = [refusal(name.partition(".")[0]) for refusal in self.refusals if "." in name]
+        return next(filter(None, reasons), "")
+
+
+def parameters_of(schema: type) -> KnownParameters:
     """The parameters of a schema by their full (dotted) names, in the order of declaration."""
     return _parameters_of(schema)
 
 
 @functools.cache  # a sweep asks for each of its points
-def _parameters_of(schema: type) -> Mapping[str, Parameter]:
-    found: dict[str, Parameter] = {}
+def _parameters_of(schema: type) -> KnownParameters:
+    found = KnownParameters()
     for field in dataclasses.fields(schema):
         if "group" in field.metadata:
             for name, inner in parameters_of(field.metadata["group"]).items():
                 full = _prefix(field) + name
                 found[full] = dataclasses.replace(inner, name=full)
+            found.refusals += (field.metadata["refusal"],) if "refusal" in field.metadata else ()
             continue
         known = dict(field.metadata["parameter"])
         free = known.pop("any_length")
@@ -171,7 +190,7 @@ def _parameters_of(schema: type) -> Mapping[str, Parameter]:
             length=length,
             **known,
         )
-    return MappingProxyType(found)
+    return found
 
 
 def check_values(schema: type, values: Mapping[str, object], owner: str = "") -> dict[str, Any]:
@@ -180,10 +199,12 @@ def check_values(schema: type, values: Mapping[str, object], owner: str = "") ->
     Raises ParameterError for an unknown name, a wrong type or a value out of bounds.
     """
     known = parameters_of(schema)
+    checked = {name: known[name].check(owner, value) for name, value in values.items() if name in known}
     for name in values:
         if name not in known:
-            raise ParameterError(f"unknown parameter {owner}.{name}: {owner} has {', '.join(known)}")
-    return {name: known[name].check(owner, value) for name, value in values.items()}
+            why = known.refusal(name) or f"{owner} has {', '.join(known)}"
+            raise ParameterError(f"unknown parameter {owner}.{name}: {why}")
+    return checked
 
 
 def build(schema: type[T], values: Mapping[str, object], owner: str = "") -> T:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from agv_ros.errors import open_text
-from agv_ros.parameters import SHARED, Parameter, ParameterError, build, check_values, parameters_of
+from agv_ros.parameters import SHARED, KnownParameters, Parameter, ParameterError, build, check_values, parameters_of
 from agv_ros.ros_yaml import RosYamlError, load
 
 
@@ -77,7 +77,7 @@ def _is_ros_own(name: str) -> bool:
     return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")
 
 
-def parse_setting(text: str, known: Mapping[str, Mapping[str, Parameter]]) -> tuple[str, str, Any]:
+def parse_setting(text: str, known: Mapping[str, KnownParameters]) -> tuple[str, str, Any]:
     """(node, parameter, value) of a setting `node.parameter=value`; an integer is taken for a double where one is due.
 
     Raises ParameterError if the text has no such form, names no known parameter or gives a value that is not allowed.
@@ -89,7 +89,8 @@ def parse_setting(text: str, known: Mapping[str, Mapping[str, Parameter]]) -> tu
     if node not in known:
         raise ParameterError(f"--set {text}: unknown node {node!r}, must be one of {', '.join(known)}")
     if name not in known[node]:
-        raise ParameterError(f"--set {text}: {node} has no parameter {name!r}, it has {', '.join(known[node])}")
+        why = known[node].refusal(name) or f"it has {', '.join(known[node])}"
+        raise ParameterError(f"--set {text}: {node} has no parameter {name!r}, {why}")
     try:
         return node, name, known[node][name].check(node, _value(literal, known[node][name]))
     except (ParameterError, RosYamlError) as error:

@@ -8,26 +8,49 @@ and a description:
 
 A registry names the parts of one kind: those of this package, and those that other packages announce by entry points.
 For each it makes an adapter, a function with the arguments that the loop calls it with, whatever the part's own order.
-Nodes call the adapter; the simulation compiles it in place of the default one.
+Nodes call the adapter; the simulation compiles it in place of the default one. An adapter refuses NaN where its
+arguments are in range, so that a wrong part ends a run, compiled or not, instead of spoiling it.
+
+What goes wrong in another package's part is one line that names the part and the reason. A part that cannot be used
+disturbs nobody until it is chosen.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
+import keyword
 import math
+import re
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from importlib.metadata import EntryPoint, entry_points
+from numbers import Real
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 from agv_ros.parameters import Parameter, ParameterError, group, parameter
 from agv_ros.substitution import Function
 
+OWN = "agv_ncs"
+"""Source of this package's parts."""
+
+IN_RANGE = 1e100
+"""A number of at least this size belongs to a loop that diverges; what a part makes of it is not held against it."""
+
+_LONGEST_VALUE = 200
+"""Characters of a value in a message."""
+
 
 class PartError(ParameterError):
     """A part that cannot be used; the text names it and the reason."""
+
+
+class NotANumberError(PartError):
+    """A part returned NaN. Raised by adapters without a text, for they are compiled."""
+
+    def __str__(self) -> str:
+        return "returns NaN"
 
 
 @dataclass(frozen=True)
@@ -50,12 +73,22 @@ class Quantity:
 class Call:
     """How the loop calls the parts of one kind."""
 
+    arguments: str
+    """Those of an adapter, as source: `x_e, y_e, ..., memory, parameters`."""
     required: tuple[str, ...]
     """Arguments that every part takes, first and in this order."""
+    result: str
+    """What a part returns, as source: `v, w` or `(x, y), (p, q)`."""
+    shape: tuple[Any, ...]
+    """The same as tuples in tuples, with None for each number."""
+    returned: str
+    """What an adapter returns, as source, in the names of `result`; {states} and {memory} where a part has such."""
+    words: str
+    """What a part returns, for messages: `v [m/s] and w [rad/s]`."""
+    in_range: tuple[str, ...]
+    """Arguments, as source, that must be in range for NaN to be the part's fault."""
     optional: tuple[str, ...] = ()
     """Arguments that a part gets if it names them."""
-    results: tuple[str, ...] = ()
-    """What it returns, in words, for messages."""
     states: str = ""
     """Where arguments of the part's own stand that are its state: after this argument and before the next required one.
 
@@ -63,6 +96,10 @@ class Call:
     """
     memory: bool = False
     """May a part name an argument `memory`, a tuple of floats that it returns anew, as the last result?"""
+    runtime: bool = False
+    """Can the parameters of such parts be changed while a node runs?"""
+    known: Mapping[str, Any] = field(default_factory=dict)
+    """What `returned` and `in_range` name beside arguments and results."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +107,14 @@ class Part:
     """A function that was chosen by its name."""
 
     name: str
-    source: str
-    """Where it comes from, for messages: `agv_ncs`, or the entry point's value."""
+    where: str
+    """What it is called in messages: `control law integral (my_laws:integral)`."""
     function: Function
     """The function as it was written."""
     adapter: Function
     """The same with the arguments that the loop calls it with."""
+    unchecked: Function
+    """The same with these arguments, its result as it is."""
     arguments: frozenset[str]
     """Names of all its arguments."""
     parameters: tuple[Parameter, ...]
@@ -94,66 +133,86 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Registry:
-    """The parts of one kind by name."""
+class Functions:
+    """Functions of one kind by name: those of this package, and those that other packages announce."""
 
     kind: str
-    """What such a part is called in messages: `control law`."""
+    """What such a function is called in messages: `control law`."""
     group: str
     """Group of entry points by which other packages announce theirs."""
-    call: Call
-    template: str
-    """Source of an adapter: {call} is the call of the part, {name} the adapter's name."""
     own: Mapping[str, Function]
     """Those of this package."""
-    _found: dict[str, Part] = field(default_factory=dict, compare=False)
+    reserved: tuple[str, ...] = ()
+    """Names of this package that stand for something else than a function."""
 
     def names(self) -> tuple[str, ...]:
-        """Names of all parts: those of this package, then those of other installed ones."""
-        return (*self.own, *(name for name in installed(self.group) if name not in self.own))
+        """All names: those of this package, then those of other installed ones, be they usable or not."""
+        known = (*self.own, *self.reserved)
+        return (*known, *(name for name in installed(self.group) if name not in known))
 
-    def find(self, name: str) -> Part:
-        """The part called `name`.
+    @property
+    def remedy(self) -> str:
+        """What to do where a name is none of `names`."""
+        return f"if another package has this {self.kind}, install it (its entry point is in the group {self.group})"
 
-        Raises PartError if there is none, if two have this name, or if it cannot be loaded or called.
+    def load(self, name: str) -> tuple[str, Function]:
+        """What the function called `name` is called in messages, and the function itself.
+
+        Raises PartError if there is none, if two have this name, or if it cannot be loaded.
         """
-        if name not in self._found:
-            self._found[name] = self._load(name)
-        return self._found[name]
-
-    def _load(self, name: str) -> Part:
         points = installed(self.group).get(name, ())
-        sources = [*(["that of agv_ncs"] if name in self.own else []), *(f"{point.value}" for point in points)]
+        known = name in self.own or name in self.reserved
+        sources = [*(["that of agv_ncs"] if known else []), *(f"{point.value} of another package" for point in points)]
         if not sources:
-            raise PartError(f"there is no {self.kind} {name!r}, must be one of {', '.join(self.names())}")
+            raise PartError(
+                f"there is no {self.kind} {name!r}, must be one of {', '.join(self.names())}: {self.remedy}"
+            )
         if len(sources) > 1:
             raise PartError(f"two {self.kind}s are called {name}: {' and '.join(sources)}; rename one")
         if name in self.own:
-            return part_of(name, "agv_ncs", self.own[name], self)
+            return f"{self.kind} {name}", self.own[name]
         where = f"{self.kind} {name} ({points[0].value})"
         try:
             function = points[0].load()
-        except Exception as error:  # another package's code, in which anything can go wrong
-            raise PartError(f"{where} cannot be loaded: {error}") from error
+        except (Exception, SystemExit) as error:  # another package's code, in which anything can go wrong
+            reason = " ".join(str(error).split()) if isinstance(error, (ImportError, AttributeError)) else _line(error)
+            raise PartError(f"{where} cannot be loaded: {reason}") from error
         function = getattr(function, "py_func", function)  # one that its author has compiled with numba
-        if not isinstance(function, types.FunctionType):
-            raise PartError(f"{where} must be a function, found {function!r}")
-        return part_of(name, points[0].value, function, self)
+        if not callable(function):
+            raise PartError(f"{where} must be a function, found {_short(function)}")
+        return where, function
+
+
+@dataclass(frozen=True)
+class Registry(Functions):
+    """The parts of one kind by name."""
+
+    call: Call = Call("", (), "", (), "", "", ())
+    _found: dict[str, Part] = field(default_factory=dict, compare=False)
+
+    def find(self, name: str) -> Part:
+        """The part called `name`. Raises PartError as `load` does, and if it cannot be called."""
+        if name not in self._found:
+            where, function = self.load(name)
+            self._found[name] = part_of(name, where, function, self.call)
+        return self._found[name]
+
+    def own_part(self, name: str) -> Part:
+        """A part of this package, whatever other packages call theirs."""
+        return part_of(name, f"{self.kind} {name}", self.own[name], self.call)
 
     def usable(self) -> dict[str, Part]:
         """All parts that can be loaded; the others are refused when they are chosen."""
-        found = {}
-        for name in self.names():
-            try:
-                found[name] = self.find(name)
-            except PartError:
-                continue
-        return found
+        return {name: self.find(name) for name in self.names() if not self.refusal(name)}
 
-    def where(self, name: str) -> str:
-        """Name and source of a part, for messages."""
-        source = self.find(name).source
-        return f"{self.kind} {name}" if source == "agv_ncs" else f"{self.kind} {name} ({source})"
+    def refusal(self, name: str) -> str:
+        """Why the part called `name` cannot be used; empty if it can, or if there is none."""
+        if name in self.names():
+            try:
+                self.find(name)
+            except PartError as error:
+                return str(error)
+        return ""
 
 
 @functools.cache
@@ -165,14 +224,16 @@ def installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
     return found
 
 
-def part_of(name: str, source: str, function: Function, registry: Registry) -> Part:
+# -- from a function to a part -----------------------------------------------------------------------------------------
+
+
+def part_of(name: str, where: str, function: Function, call: Call) -> Part:
     """A part from its function. Raises PartError for a signature that the loop cannot call, naming what is wrong."""
-    where, call = f"{registry.kind} {name} ({source})", registry.call
-    try:
-        hints = get_type_hints(function, include_extras=True)
-        signature = inspect.signature(function)
-    except Exception as error:  # an annotation that does not evaluate can raise anything
-        raise PartError(f"{where}: its signature cannot be read: {error}") from error
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or keyword.iskeyword(name):
+        raise PartError(f"{where}: its name must be letters, digits and _, as its parameters are called {name}.gain")
+    if not isinstance(function, types.FunctionType):
+        raise PartError(f"{where} must be a function, found {_short(function)}")
+    signature = inspect.signature(function)
     names = list(signature.parameters)
     for argument in signature.parameters.values():
         if argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD, argument.KEYWORD_ONLY):
@@ -185,86 +246,194 @@ def part_of(name: str, source: str, function: Function, registry: Registry) -> P
             states = tuple(names[begin : names.index(after)])
             wanted[begin:begin] = states
     if names[: len(wanted)] != wanted:
-        raise PartError(f"{where}: its first arguments must be {', '.join(wanted)}, found {', '.join(names) or 'none'}")
+        raise PartError(
+            f"{where}: its first arguments must be {', '.join(call.required)}, found {', '.join(names) or 'none'}"
+        )
     memory: tuple[float, ...] = ()
     parameters, limits = [], []
     for argument in list(signature.parameters.values())[len(wanted) :]:
         if argument.name == "memory" and call.memory:
             memory = _initial_memory(argument, where)
         elif argument.name not in call.optional:
-            found, is_limit = _parameter_of(argument, hints.get(argument.name), where)
+            found, is_limit = _parameter_of(argument, _hint_of(argument, function, where), where, call.runtime)
             parameters.append(found)
             limits += [found.name] if is_limit else []
-    adapter = _adapter(name, function, names, states, tuple(p.name for p in parameters), registry)
+    adapter, unchecked = _adapters(
+        name, where, function, names, states, [known.name for known in parameters], len(memory), call
+    )
     return Part(
-        name, source, function, adapter, frozenset(names), tuple(parameters), tuple(limits), states, memory
+        name, where, function, adapter, unchecked, frozenset(names), tuple(parameters), tuple(limits), states, memory
     )  # fmt: skip
 
 
 def _initial_memory(argument: inspect.Parameter, where: str) -> tuple[float, ...]:
     begin = argument.default
-    if not isinstance(begin, tuple) or not all(isinstance(x, (int, float)) and math.isfinite(x) for x in begin):
-        raise PartError(f"{where}: memory must have a tuple of numbers as default, which it begins with, got {begin!r}")
+    numbers = isinstance(begin, tuple) and all(isinstance(x, (int, float)) and math.isfinite(x) for x in begin)
+    if not numbers or not begin:
+        found = "no default" if begin is argument.empty else _short(begin)
+        raise PartError(f"{where}: memory must have a tuple of numbers as default, which it begins with, got {found}")
     return tuple(map(float, begin))
 
 
-def _parameter_of(argument: inspect.Parameter, hint: Any, where: str) -> tuple[Parameter, bool]:
-    known = Quantity("")
+def _hint_of(argument: inspect.Parameter, function: Function, where: str) -> Any:
+    """The type that an argument is declared with; evaluated alone, for others may be imported for types only."""
+    if argument.annotation is argument.empty:
+        return None
+    alone = types.SimpleNamespace(__annotations__={argument.name: argument.annotation})
+    try:
+        return get_type_hints(alone, function.__globals__, include_extras=True)[argument.name]
+    except Exception as error:  # an annotation that does not evaluate can raise anything
+        raise PartError(f"{where}: the type of its parameter {argument.name} cannot be read: {_line(error)}") from error
+
+
+def _parameter_of(argument: inspect.Parameter, hint: Any, where: str, runtime: bool) -> tuple[Parameter, bool]:
+    known, default = Quantity(""), argument.default
     if get_origin(hint) is Annotated:
         known = next((extra for extra in get_args(hint)[1:] if isinstance(extra, Quantity)), known)
         hint = get_args(hint)[0]
-    default = argument.default
     if default is argument.empty:
-        raise PartError(f"{where}: its parameter {argument.name} needs a default")
-    if isinstance(default, bool) or not isinstance(default, (int, float)) or hint not in (None, float, int):
-        raise PartError(f"{where}: its parameter {argument.name} must be a float, got {argument}")
+        raise PartError(f"{where}: its parameter {argument.name} needs a default, as in {argument.name}=1.0")
+    if type(default) is int:
+        raise PartError(f"{where}: its parameter {argument.name} must be a float, got {default}: write {default}.0")
+    if not isinstance(default, float) or hint not in (None, float):
+        raise PartError(f"{where}: its parameter {argument.name} must be a float, got {_short(argument)}")
     high = math.inf if known.high is None and math.isinf(default) else known.high
     found = Parameter(
         argument.name, "double", float(default), known.unit, known.description or f"parameter of {where}",
-        known.low, high, known.above, runtime=True,
+        known.low, high, known.above, runtime=runtime,
     )  # fmt: skip
     try:
         found.check("", found.default)
     except ParameterError as error:
-        raise PartError(f"{where}: default of a parameter: {error}") from None
+        raise PartError(f"{where}: the default of its parameter {error}") from None
     return found, known.limit or math.isinf(default)
 
 
-def _adapter(
-    name: str, function: Function, arguments: Sequence[str], states: Sequence[str],
-    parameters: Sequence[str], registry: Registry,
-) -> Function:  # fmt: skip
-    """The function that the loop calls: the part's arguments by name, its states and parameters out of tuples.
+_WHERE: dict[types.CodeType, str] = {}
+"""What a part is called in messages, by the code of its adapter."""
 
-    Not a closure, which could not be compiled and kept: what it calls is a global of its own.
+
+def _adapters(
+    name: str, where: str, function: Function, arguments: Sequence[str], states: Sequence[str],
+    parameters: Sequence[str], memory: int, call: Call,
+) -> tuple[Function, Function]:  # fmt: skip
+    """The function that the loop calls, and the same whose result is left as it is.
+
+    The part gets its arguments by name, its states and parameters out of tuples. Not closures, which could not be
+    compiled and kept: what they call is a global of their own. Numbers are made floats, for a compiler must know that
+    they are.
     """
     values = {state: f"states[{i}]" for i, state in enumerate(states)}
     values |= {parameter: f"parameters[{i}]" for i, parameter in enumerate(parameters)}
-    call = f"part({', '.join(values.get(argument, argument) for argument in arguments)})"
-    several = len(states)
-    unpacked = "".join(f", s{i}" for i in range(several))
-    packed = "(" + "".join(f"s{i}, " for i in range(several)) + ")"
-    text = registry.template.format(
-        name=f"{registry.kind.replace(' ', '_')}_{name}", call=call, unpacked=unpacked, packed=packed,
-        memory=", memory" if "memory" in arguments and registry.call.memory else "",
-    )  # fmt: skip
-    known: dict[str, Any] = {"part": function}
-    exec(compile(text, f"<adapter of {registry.kind} {name}>", "exec"), known)
-    adapter = next(
-        value for key, value in known.items() if isinstance(value, types.FunctionType) and key != "part"
-    )  # fmt: skip
+    called = f"part({', '.join(values.get(argument, argument) for argument in arguments)})"
+    kept, remembered = [f"s{i}" for i in range(len(states))], [f"m{i}" for i in range(memory)]
+    pattern = ", ".join([call.result, *kept, *([f"({', '.join(remembered)},)"] if memory else [])])
+    results = [*re.findall(r"\w+", call.result), *kept]
+    of_states = f"({''.join(f'float({s}), ' for s in kept)})"
+    of_memory = f"({''.join(f'float({m}), ' for m in remembered)})" if memory else "memory"
+    nan = " or ".join(f"math.isnan({result})" for result in results)
+    size = " + ".join(f"abs({argument})" for argument in call.in_range)
+    title = re.sub(r"\W", "_", where.partition(" (")[0])
+    text = (
+        f"def {title}({call.arguments}):\n"
+        f"    {pattern} = {called}\n"
+        f"    if ({nan}) and {size} < {IN_RANGE!r}:\n"
+        f"        raise NotANumberError\n"
+        f"    return {call.returned.format(states=of_states, memory=of_memory)}\n\n\n"
+        f"def unchecked({call.arguments}):\n"
+        f"    return {called}\n"
+    )
+    known: dict[str, Any] = {"part": function, "math": math, "NotANumberError": NotANumberError, **call.known}
+    exec(compile(text, f"<adapter of {where}>", "exec"), known)
+    adapter, unchecked = known[title], known["unchecked"]
     adapter.__doc__ = text  # what tells it apart from adapters of other signatures
-    return adapter
+    _WHERE[adapter.__code__] = where
+    return adapter, unchecked
 
 
-def schema_of(class_name: str, parts: Mapping[str, Part], module: dict[str, Any]) -> type:
+# -- parts that are wrong ----------------------------------------------------------------------------------------------
+
+
+def try_part(part: Part, call: Call, *arguments: Any) -> None:
+    """Call a part as the loop does. Raises PartError if it raises, or returns anything but finite numbers."""
+    try:
+        found = part.unchecked(*arguments)
+    except Exception as error:  # another package's code, in which anything can go wrong
+        raise PartError(f"{part.where} {complaint(error)}") from error
+    words = [call.words, *part.states, *([f"its memory, {len(part.memory)} of them"] if part.memory else [])]
+    if _shape(found) != _expected_shape(part, call):
+        raise PartError(f"{part.where} must return numbers, a tuple of {', '.join(words)}; got {_short(found)}")
+    if not all(math.isfinite(x) for x in _flat(found)):
+        given = ", ".join(f"{name} = {_short(value)}" for name, value in zip(call.required, arguments, strict=False))
+        raise PartError(f"{part.where} must return finite numbers, got {_short(found)} for {given}")
+
+
+def _shape(found: Any) -> Any:
+    """Tuples in tuples as they are, with None for each number, and the type of what is no number."""
+    if isinstance(found, tuple):
+        return tuple(map(_shape, found))
+    return None if isinstance(found, Real) else type(found)
+
+
+def _expected_shape(part: Part, call: Call) -> Any:
+    memory = [(None,) * len(part.memory)] if part.memory else []
+    return (*call.shape, *(None for _ in part.states), *memory)
+
+
+def _flat(found: Any) -> Any:
+    if isinstance(found, tuple):
+        for inner in found:
+            yield from _flat(inner)
+    else:
+        yield found
+
+
+def complaint(error: BaseException) -> str:
+    """What a part did, as the end of a sentence that begins with its name."""
+    return str(error) if isinstance(error, NotANumberError) else f"raises {_line(error)}"
+
+
+def culprit(error: BaseException) -> str:
+    """The part out of whose adapter an error came, empty if it came from elsewhere."""
+    frame, found = error.__traceback__, ""
+    while frame is not None:
+        found = _WHERE.get(frame.tb_frame.f_code, found)
+        frame = frame.tb_next
+    return found
+
+
+def _line(error: BaseException) -> str:
+    """An error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _short(value: object) -> str:
+    """A value for a message."""
+    text = str(value) if isinstance(value, inspect.Parameter) else repr(value)
+    return text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + " ..."
+
+
+# -- their parameters --------------------------------------------------------------------------------------------------
+
+_OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+"""Parameters that a node has without declaring them."""
+
+
+def refuse_taken(part: Part, taken: Sequence[str]) -> None:
+    """Raise PartError for a part that is called as a parameter of its node, and so would be its group of parameters."""
+    if part.parameters and part.name in (*taken, *_OF_ROS):
+        raise PartError(f"{part.where}: its node has a parameter {part.name}, so none can be called so: rename it")
+
+
+def schema_of(class_name: str, parts: Mapping[str, Part], taken: Sequence[str], module: dict[str, Any]) -> type:
     """A schema with a group of parameters for each part that has some: names `part.parameter`.
 
-    The classes are put into the `module` given by its globals, where other processes find them.
+    Parts whose names are `taken` by parameters of the node are left out. The classes are put into the `module` given by
+    its globals, where other processes find them.
     """
     fields: list[tuple[str, type, Any]] = []
     for part in parts.values():
-        if part.parameters:
+        if part.parameters and part.name not in (*taken, *_OF_ROS):
             own = _dataclass(
                 f"{class_name}_{part.name}", [(p.name, float, _field_of(p)) for p in part.parameters], module
             )
@@ -278,6 +447,22 @@ def _dataclass(name: str, fields: list[tuple[str, type, Any]], module: dict[str,
     return made
 
 
+def values_of(part: Part, groups: object) -> tuple[float, ...]:
+    """The values of a part's parameters in an instance of `schema_of`, in the order of its signature.
+
+    Raises PartError for a part that was not there yet when the schema was made.
+    """
+    if not part.parameters:
+        return ()
+    own = getattr(groups, part.name, None)
+    if own is None:
+        raise PartError(
+            f"{part.where} could not be loaded when its parameters were declared: let its module import nothing of "
+            "agv_ncs but agv_ros.parts"
+        )
+    return tuple(getattr(own, known.name) for known in part.parameters)
+
+
 def _field_of(known: Parameter) -> Any:
     return parameter(
         known.default, known.description, unit=known.unit, low=known.low, high=known.high, above=known.above,
@@ -288,23 +473,3 @@ def _field_of(known: Parameter) -> Any:
 def field_of(part: Part, name: str) -> Any:
     """Dataclass field for one parameter of a part, as `parameter` makes it."""
     return _field_of(next(known for known in part.parameters if known.name == name))
-
-
-def checked(part: Part, where: str, outcome: Callable[[], Any]) -> tuple[float, ...]:
-    """The numbers that a part returned, flattened. Raises PartError if it raises, or returns something else."""
-    try:
-        found = outcome()
-    except Exception as error:  # another package's code, in which anything can go wrong
-        raise PartError(f"{where} raises {type(error).__name__}: {error}") from error
-    flat = tuple(_flat(found))
-    if not all(isinstance(x, (int, float)) for x in flat):
-        raise PartError(f"{where} must return numbers, got {found!r}")
-    return flat
-
-
-def _flat(found: Any) -> Any:
-    if isinstance(found, tuple):
-        for inner in found:
-            yield from _flat(inner)
-    else:
-        yield found

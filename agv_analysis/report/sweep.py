@@ -36,7 +36,7 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
     """Write the report of a sweep; `command` makes it anew. Raises UserError as `write_report`."""
     drawn = {"instability": sweep_figure(sweep, rows)} if rows and can_draw(sweep) else {}
     plain = [{name: _plain(value) for name, value in row.items()} for row in rows]
-    parameters = sweep.base.to_yaml()
+    parameters = sweep.base.to_yaml(of_all_parts=True)
     html = fill(
         "sweep.html.j2",
         figures=drawn,

@@ -28,6 +28,7 @@ from agv_cloud.reference.reference import Reference
 from agv_cloud.staleness.estimate import PoseEstimator
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_ros.errors import UserError
+from agv_ros.parts import PartError, complaint, culprit
 from agv_ros.pose import Pose
 from agv_ros.substitution import replaced
 
@@ -135,9 +136,14 @@ def _answers(run: Run, scenario: Scenario) -> tuple[Floats, Floats]:
     for i in map(int, np.flatnonzero(there)):
         row = int(held[i])
         k, taken = int(run.k[i]), int(run.k[row])
-        estimate = estimator.at(k, taken, Pose(*run.sent_pose[row].tolist()), reference)
-        at_edge = EdgeState(*estimate, k - taken, 0.0, 0.0, memory)
-        rows[i], memory = step(at_edge, reference(k), settings)
+        try:
+            estimate = estimator.at(k, taken, Pose(*run.sent_pose[row].tolist()), reference)
+            at_edge = EdgeState(*estimate, k - taken, 0.0, 0.0, memory)
+            rows[i], memory = step(at_edge, reference(k), settings)
+        except Exception as error:  # another package's part, in which anything can go wrong
+            if not culprit(error):
+                raise
+            raise PartError(f"{culprit(error)} {complaint(error)}, at step {k}") from error
         if estimator.uses_commands and np.isfinite(run.command[i]).all():
             estimator.add_command(k, *run.command[i].tolist())
     return rows[:, :3], rows[:, 3:]

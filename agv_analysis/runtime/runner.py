@@ -122,8 +122,8 @@ def replay_in_process(
 
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
-    recorded, predicts = bag is not None, scenario.error_detector.policy == "predict"
-    listeners = {"error_detector": 2 + recorded, "controller": 1 + predicts + recorded}
+    recorded, hears = bag is not None, scenario.error_detector.hears_commands
+    listeners = {"error_detector": 2 + recorded, "controller": 1 + hears + recorded}
     with stop_on_signals() as stop, params_file(scenario) as params, OneProcess(inputs.namespace) as process:
         player = process.add(
             partial(ReplayNode, inputs, pace, not starts_edge),
@@ -200,10 +200,18 @@ class Loop(NamedTuple):
     """All of them but the recorder."""
     recorder: RecorderNode | None
 
+    def is_over(self) -> bool:
+        """Has the plant done its steps, or can a node not go on? Asked after each event."""
+        for node in self.nodes:  # noqa: SIM110  # a generator takes four times as long
+            if node.finished:
+                return True
+        return False
+
     def outcome(self, rate: float, stopped: bool) -> Outcome:
         """How it ended."""
         plant, recorder = self.plant, self.recorder
-        failure = plant.failure or (f"interrupted at step {plant.k}" if stopped and not plant.finished else "")
+        failure = plant.failure or next((node.failure for node in self.nodes if node.failure), "")
+        failure = failure or (f"interrupted at step {plant.k}" if stopped and not plant.finished else "")
         recorded = (recorder.summary, recorder.failure) if recorder else ("", "")
         return Outcome(plant.k, rate, failure, *recorded)
 
@@ -237,7 +245,7 @@ class _Watch:
 
     def __init__(self, loops: Sequence[Loop], stop: Stop, progress: Progress) -> None:
         self._plants = [loop.plant for loop in loops]
-        self._unfinished = list(self._plants)
+        self._unfinished = list(loops)
         self._stop, self._progress = stop, progress
         self._asked = 0
         self.paces = [Speedometer() for _ in loops]
@@ -247,7 +255,7 @@ class _Watch:
         self._asked += 1
         if self._asked % _EVENTS_PER_LOOK == 0:
             self.look()
-        while self._unfinished and self._unfinished[-1].finished:  # one is looked at, for one is enough
+        while self._unfinished and self._unfinished[-1].is_over():  # one is looked at, for one is enough
             self._unfinished.pop()
         return not self._unfinished or self._stop.requested
 
@@ -273,7 +281,7 @@ def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
         check_length(channel, steps)
     met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": _PATIENCE if recorded else scenario.plant.stop_timeout}
     nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
-    if scenario.error_detector.policy == "predict" and not scenario.plant.plan_steps:  # which hears commands as well
+    if scenario.error_detector.hears_commands and not scenario.plant.plan_steps:
         nodes["controller"] = dataclasses.replace(nodes["controller"], wait_for_subscribers=2 + recorded)
     return Scenario(**nodes)
 

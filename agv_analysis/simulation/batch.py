@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from itertools import groupby, zip_longest
 from typing import get_type_hints
 
@@ -25,11 +26,12 @@ from agv_analysis.simulation.loop import (
     statistics_of_twins,
     statistics_of_two,
 )
-from agv_analysis.simulation.parts import replacements_of
+from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.reference import reference_of
-from agv_analysis.simulation.single import run_parts, settings_of, start_of, steps_of
+from agv_analysis.simulation.single import settings_of, simulate, start_of, steps_of
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
+from agv_ros.parts import PartError
 from agv_ros.substitution import Replacements
 
 STATISTICS = np.dtype([
@@ -67,7 +69,7 @@ def simulate_batch(
     Seeds are paired: under one seed all scenarios with the same channel meet the same outages, and all AGVs the same
     noise and slip; `relay.seed` and `plant.seed` of the scenarios do not count. `workers` threads, one a core by
     default, do the work; their number changes nothing in the result. `progress` is told how many runs are done. Raises
-    UserError if a run has no end.
+    UserError if a run has no end, PartError if a control law, a vehicle or a policy raises or returns NaN.
     """
     batch, workers, done = _Batch(scenarios, seeds, twins), workers or cores(), 0
     with ThreadPoolExecutor(workers) as pool:
@@ -115,9 +117,24 @@ class _Batch:
         for kind, jobs in groupby(sorted(unit, key=lambda job: self._kind[job[0]]), lambda job: self._kind[job[0]]):
             row = self._kind.index(kind)
             parts = replacements_of(self._scenarios[row])
-            for job, found, contraction in run(self._reference(row), list(jobs), realisations, parts):
-                self.table[job] = (*found, contraction)
+            of_kind = list(jobs)
+            try:
+                for job, found, contraction in run(self._reference(row), of_kind, realisations, parts):
+                    self.table[job] = (*found, contraction)
+            except PartError as error:
+                raise PartError(self._where_it_fails(of_kind) or str(error)) from error
         return len(unit)
+
+    def _where_it_fails(self, jobs: list[Job]) -> str:
+        """What is wrong with a part, and at which step of which run; empty if no single run tells."""
+        for row, column in jobs:
+            scenario, seed = self._scenarios[row], self._seeds[column]
+            relay, plant = replace(scenario.relay, seed=seed), replace(scenario.plant, seed=seed)
+            try:
+                simulate(replace(scenario, relay=relay, plant=plant))
+            except PartError as error:
+                return f"{error} of the run with seed {seed}"
+        return ""
 
     def _by_twos(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements

@@ -1,10 +1,13 @@
-"""Which functions of the loop a scenario's parts take the place of."""
+"""Which functions of the loop a scenario's parts take the place of, and loops that are run with them."""
 
 from __future__ import annotations
 
 import functools
 from typing import Any
 
+import numpy as np
+
+from agv_analysis.compiled import HAS_NUMBA, compiled
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import recall_memory, store_memory
 from agv_cloud.control.command import control_law
@@ -13,7 +16,8 @@ from agv_cloud.staleness.estimate import staleness_policy
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.vehicle.motion import vehicle_step
 from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
-from agv_ros.substitution import Function, Replacements
+from agv_ros.parts import PartError, complaint, culprit
+from agv_ros.substitution import Function, Replacements, replaced
 
 
 def replacements_of(scenario: Scenario) -> Replacements:
@@ -53,3 +57,37 @@ def memory_functions(size: int) -> tuple[Function, Function]:
     recall, store = known["recall"], known["store"]
     recall.__doc__ = store.__doc__ = text
     return recall, store
+
+
+_NOT_COMPILED: set[tuple[Function, tuple[tuple[Function, Function], ...]]] = set()
+"""Loops, with their parts, that numba has refused: it would take seconds to refuse them again."""
+
+
+def run_parts(loop: Function, parts: Replacements, *arguments: Any) -> Any:
+    """A loop with its parts, compiled; as plain Python where a part is more than numba compiles. The numbers are equal.
+
+    Raises PartError if a part raises or returns NaN.
+    """
+    if not parts:
+        return compiled(loop)(*arguments)
+    key = loop, tuple(parts.items())
+    if HAS_NUMBA and key not in _NOT_COMPILED:
+        try:
+            return compiled(loop, parts)(*arguments)
+        except Exception:  # whatever numba, or a part in it, raises; plain Python says which
+            found = _run_plain(loop, parts, arguments)
+            _NOT_COMPILED.add(key)
+            return found
+    return _run_plain(loop, parts, arguments)
+
+
+def _run_plain(loop: Function, parts: Replacements, arguments: tuple[Any, ...]) -> Any:
+    try:
+        # What comes out of arrays shall do what floats do: diverge quietly, but not divide by zero.
+        with np.errstate(divide="raise", over="ignore", invalid="ignore"):
+            return replaced(loop, parts)(*arguments)
+    except Exception as error:
+        where = culprit(error)
+        if not where:
+            raise
+        raise PartError(f"{where} {complaint(error)}") from error

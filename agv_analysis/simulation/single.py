@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled import numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import history_over_links
 from agv_analysis.simulation.loop import Loop, Rows, RunInputs, Settings, at_rest, history
 from agv_analysis.simulation.noise import measurements, normals
-from agv_analysis.simulation.parts import replacements_of
+from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.simulated_link import SimulatedLink
 from agv_cloud.control.registry import CONTROL_LAWS
@@ -24,7 +23,8 @@ from agv_plant.parameters import PlantParameters
 from agv_plant.vehicle.motion import NOISE, SLIP, vehicle_parameters
 from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_ros.errors import UserError
-from agv_ros.substitution import Replacements, replaced
+from agv_ros.parts import PartError
+from agv_ros.substitution import Replacements
 
 _PAPERS_VEHICLE = vehicle_parameters(PlantParameters())
 
@@ -32,8 +32,9 @@ _PAPERS_VEHICLE = vehicle_parameters(PlantParameters())
 def simulate(scenario: Scenario) -> Run:
     """The run of a scenario in lockstep, as a recording of the nodes would give it.
 
-    Raises UserError if the run has no end, TrackFileError for a bad track file. A loop that leaves the range of numbers
-    ends there, and its run says so in its notes.
+    Raises UserError if the run has no end, TrackFileError for a bad track file, PartError if a control law, a vehicle
+    or a policy raises or returns NaN. A loop that leaves the range of numbers ends there, and its run says so in its
+    notes.
     """
     steps, relay, plant = steps_of(scenario), scenario.relay, scenario.plant
     reference = reference_of(scenario.error_detector, steps + scenario.controller.steps_ahead).copy()
@@ -47,7 +48,6 @@ def simulate(scenario: Scenario) -> Run:
     lost = numbers(up.lost), numbers(down.lost)
     inputs = RunInputs(*lost, start_of(scenario), settings, noise, slip)
     rows, done = _drive(numbers(reference), inputs, up, down, replacements_of(scenario))
-    check_commands(scenario, rows[:done, 3:8])
     pose, k = rows[:done, 0:3], np.arange(done)
     return Run(
         scenario=scenario,
@@ -74,45 +74,15 @@ def _drive(
 
     Where a message that is not lost is there at once, outcomes known beforehand are all that is needed of the radio.
     """
-    rows = np.empty((len(inputs.lost), 8))
-    if up.is_direct and down.is_direct:
-        n_ul = np.empty(len(rows), dtype=np.int64)
-        return rows, run_parts(history, parts, reference, inputs, rows, n_ul)
-    links = up.link_inputs, down.link_inputs, up.trace, down.trace
-    return rows, run_parts(history_over_links, parts, reference, inputs, *links, rows)
-
-
-def run_parts(loop: Any, parts: Replacements, *arguments: Any) -> Any:
-    """A loop with its parts, compiled; as plain Python where another package's part is more than numba compiles.
-
-    Raises UserError if such a part raises.
-    """
+    rows = np.full((len(inputs.lost), 8), math.nan)
     try:
-        return compiled(loop, parts)(*arguments)
-    except Exception as error:
-        if not parts:
-            raise
-        try:
-            return replaced(loop, parts)(*arguments)
-        except Exception as again:
-            names = ", ".join(sorted(part.__name__ for part in parts.values()))
-            raise UserError(f"a part of the loop ({names}) raises {type(again).__name__}: {again}") from error
-
-
-def check_commands(scenario: Scenario, rows: Floats) -> None:
-    """Raises UserError where the control law made no number of a finite error; rows of eps and u, shape (N, 5)."""
-    usable = np.isfinite(rows[:, :3]).all(axis=1) & (np.abs(rows[:, :3]) < LARGEST_ERROR).all(axis=1)
-    wrong = np.flatnonzero(usable & np.isnan(rows[:, 3:]).any(axis=1))
-    if len(wrong):
-        k = int(wrong[0])
-        raise UserError(
-            f"{CONTROL_LAWS.where(scenario.controller.law)} returns NaN at step {k}, for the error "
-            f"{tuple(rows[k, :3].tolist())}"
-        )
-
-
-LARGEST_ERROR = 1e100
-"""Beyond this [m] a loop has diverged, and a law may compute with infinity."""
+        if up.is_direct and down.is_direct:
+            n_ul = np.empty(len(rows), dtype=np.int64)
+            return rows, run_parts(history, parts, reference, inputs, rows, n_ul)
+        links = up.link_inputs, down.link_inputs, up.trace, down.trace
+        return rows, run_parts(history_over_links, parts, reference, inputs, *links, rows)
+    except PartError as error:  # a slot's pose is in its row before its parts are called
+        raise PartError(f"{error}, at step {np.count_nonzero(np.isfinite(rows[:, 0])) - 1}") from error
 
 
 def start_of(scenario: Scenario, offset: float = 0.0) -> Loop:

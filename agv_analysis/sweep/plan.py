@@ -14,10 +14,10 @@ import numpy as np
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_analysis.simulation.single import steps_of
 from agv_ros.errors import UserError
-from agv_ros.parameters import SHARED, Parameter, as_dict, build, parameters_of
+from agv_ros.parameters import SHARED, KnownParameters, as_dict, build, parameters_of
 from agv_ros.params_file import parse_setting
 
-KNOWN: Mapping[str, Mapping[str, Parameter]] = {node: parameters_of(schema) for node, schema in SCHEMAS.items()}
+KNOWN: Mapping[str, KnownParameters] = {node: parameters_of(schema) for node, schema in SCHEMAS.items()}
 
 MAX_POINTS = 1_000_000
 MAX_VALUES = 10_000

@@ -66,7 +66,7 @@ def describe(sweep: Sweep) -> dict[str, Any]:
     """All that the numbers of a sweep depend on."""
     return {
         "version": version(),
-        "params": sweep.base.to_yaml(),
+        "params": sweep.base.to_yaml(of_all_parts=True),
         "vary": {axis.name: list(axis.values) for axis in sweep.axes},
         "first_seed": sweep.base.relay.seed,
         "seeds": sweep.seed_count,

@@ -17,7 +17,8 @@ def pure_pursuit(
     look_ahead: float,
     kx: Annotated[float, Quantity("gain of the distance along the circle", "1/s", low=0.0, high=1e6)] = 2.0,
     closest: Annotated[
-        float, Quantity("distance of the point ahead below which the circle does not get tighter", "m", above=0.0)
+        float,
+        Quantity("distance of the point ahead below which the circle does not get tighter", "m", above=0.0, high=100.0),
     ] = 0.1,
 ) -> tuple[float, float]:
     """Command (v [m/s], w [rad/s]) along the circle from the AGV, tangent to its heading, to the point (x_e, y_e) [m].

@@ -19,11 +19,16 @@ UNICYCLE = "unicycle"
 VEHICLES = Registry(
     kind="vehicle",
     group="agv_ncs.vehicles",
-    call=Call(required=("x", "y", "theta", "v", "w", "dt"), optional=("arc", "v_driven", "w_driven"), states="theta"),
-    template=(
-        "def {name}(x, y, theta, states, v, w, v_driven, w_driven, dt, arc, parameters):\n"
-        "    x, y, theta{unpacked} = {call}\n"
-        "    return x, y, theta, {packed}\n"
-    ),
     own={UNICYCLE: unicycle, "bicycle": bicycle},
+    call=Call(
+        arguments="x, y, theta, states, v, w, v_driven, w_driven, dt, arc, parameters",
+        required=("x", "y", "theta", "v", "w", "dt"),
+        optional=("arc", "v_driven", "w_driven"),
+        states="theta",
+        result="x_to, y_to, theta_to",
+        shape=(None, None, None),
+        returned="float(x_to), float(y_to), float(theta_to), {states}",
+        words="x [m], y [m], theta [rad]",
+        in_range=("x", "y", "theta", "v", "w"),
+    ),
 )

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario, parse_scenario
+from agv_analysis.scenario import PART_CHOICES, SCHEMAS, Scenario, load_scenario, parse_scenario
+from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.reference.tracks import TRACKS
 from agv_plant.channels import MODELS
-from agv_ros.parameters import Parameter, ParameterError, as_dict, parameters_of
+from agv_ros.parameters import Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid
 
 DEFAULTS = Scenario(**{node: schema() for node, schema in SCHEMAS.items()})
@@ -115,7 +116,7 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
 
 
 ALONE = {
-    "track", "wait_for_subscribers", "stop_timeout", "frame_prefix", "plan_steps", "downlink_policy",
+    "track", "wait_for_subscribers", "stop_timeout", "frame_prefix", "plan_steps", "downlink_policy", "look_ahead",
     *(f"{link}.{name}" for link in ("uplink", "downlink") for name in ("schedule", "hole_circles", "hole_polygons")),
 }  # fmt: skip
 """What a file may not set for one node without setting something else."""
@@ -136,24 +137,34 @@ def scenarios(draw: st.DrawFn) -> Scenario:
             lines["relay"][f"{link}.vehicles"] = 1000
         if lines["relay"].get(f"{link}.model") == "coverage_hole":
             lines["relay"][f"{link}.hole_circles"] = (0.0, 0.0, 1.0)
-    nodes = {node: _build(schema, lines[node]) for node, schema in SCHEMAS.items()}
-    return Scenario(**nodes)
-
-
-def _build(schema: type, values: dict[str, Any]) -> Any:
-    flat = as_dict(schema()) | values
-    grouped: dict[str, Any] = {}
-    for field in dataclasses.fields(schema):
-        prefix = f"{field.name}."
-        inner = {name[len(prefix) :]: value for name, value in flat.items() if name.startswith(prefix)}
-        grouped[field.name] = field.metadata["group"](**inner) if inner else flat[field.name]
-    return schema(**grouped)
+    law = lines["controller"].get("law")
+    if law is not None and "look_ahead" in CONTROL_LAWS.find(law).arguments:
+        for values in lines.values():
+            values["look_ahead"] = 1.0
+    return Scenario(**{node: build(schema, lines[node], node) for node, schema in SCHEMAS.items()})
 
 
 @settings(deadline=None, derandomize=True)
 @given(scenarios())
 def test_a_scenario_written_out_is_the_same_scenario(scenario: Scenario) -> None:
-    assert parse_scenario(scenario.to_yaml(), "f.yaml") == scenario
+    assert parse_scenario(scenario.to_yaml(of_all_parts=True), "f.yaml") == scenario
+
+
+@settings(deadline=None, derandomize=True)
+@given(scenarios())
+def test_only_what_belongs_to_the_parts_chosen_is_written_out(scenario: Scenario) -> None:
+    text = scenario.to_yaml()
+    found = parse_scenario(text, "f.yaml")
+    assert found.to_yaml() == text
+    for node in SCHEMAS:
+        values, read = as_dict(getattr(scenario, node)), as_dict(getattr(found, node))
+        others: set[str] = set()
+        if node in PART_CHOICES:
+            choice = PART_CHOICES[node]
+            chosen = values[choice.parameter]
+            others = {name for part in choice.registry.names() if part != chosen for name in choice.names(part)}
+        defaults = as_dict(SCHEMAS[node]())
+        assert read == {name: defaults[name] if name in others else value for name, value in values.items()}
 
 
 @pytest.mark.parametrize("track_file", ["", "1e3", "y", "no", "~", "inf", "track 1.csv", "10", "ä.csv", "a: b", "1:30"])

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from agv_cloud.error_detection import ErrorDetection, PolicyError
+from agv_cloud.error_detection import ErrorDetection
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference.path_reference import PathReference
 from agv_cloud.reference.reference import Reference
 from agv_cloud.step import EdgeStep
 from agv_ros.messages import StampedPose
+from agv_ros.parts import PartError
 
 LINE = ErrorDetectorParameters(track="line", speed=0.5, track_start=(0.0, 0.0, 0.0), plan_steps=2)
 
@@ -49,5 +50,5 @@ def test_a_policy_that_raises_is_named_with_its_step(monkeypatch: pytest.MonkeyP
         raise ZeroDivisionError("no such pose")
 
     monkeypatch.setattr(detection.estimator, "at", broken)
-    with pytest.raises(PolicyError, match="raises ZeroDivisionError: no such pose, at step 7"):
+    with pytest.raises(PartError, match="raises ZeroDivisionError: no such pose, at step 7"):
         detection.detect(step(7, 7))

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agv_analysis.scenario import SCHEMAS
+from agv_cloud.control.registry import CONTROL_LAWS
 from agv_ros.errors import UserError
 from agv_ros.parameters import (
     SHARED,
@@ -81,7 +82,8 @@ def test_every_double_refuses_what_is_no_number_and_what_is_an_integer(found: Pa
     assert refusal(found, 25).endswith("is a double, got the integer 25: write 25.0")
     for value in (True, "25.0", None, [1.0], 1 + 0j):
         assert refusal(found, value).endswith(f"is a double, got {value!r}")
-    if found.name not in ("v_max", "duration", "w_max", "a_max", "j_max") and not found.name.endswith(".lifetime"):
+    limits = ("v_max", "duration", "w_max", "a_max", "j_max", "lifetime", "steering_rate")
+    if found.name.rpartition(".")[2] not in limits:
         assert "got inf" in refusal(found, math.inf)
     else:
         assert found.check("node", math.inf) == math.inf
@@ -116,7 +118,9 @@ def test_every_integer_refuses_doubles_and_bools(found: Parameter) -> None:
 def test_every_string_refuses_numbers_and_names_its_choices(found: Parameter) -> None:
     assert refusal(found, 5).endswith("is a string, got 5")
     if found.choices:
-        assert refusal(found, "nonsense").endswith(f"must be one of {', '.join(found.choices)}, got 'nonsense'")
+        remedy = f": {found.remedy}" if found.remedy else ""
+        refused = f"must be one of {', '.join(found.choices)}, got 'nonsense'{remedy}"
+        assert refusal(found, "nonsense").endswith(refused)
         assert all(found.check("node", choice) == choice for choice in found.choices)
 
 
@@ -154,6 +158,8 @@ def test_what_can_change_while_running() -> None:
         f"{node}.{name}" for node, schema in SCHEMAS.items() for name, p in parameters_of(schema).items() if p.runtime
     }
     gains = {f"controller.{name}" for name in ("kx", "ky", "ktheta", "v_max")}
+    for law in ("state_feedback", "pure_pursuit"):
+        gains |= {f"controller.{law}.{found.name}" for found in CONTROL_LAWS.find(law).parameters}
     losses = {
         f"relay.{link}.{name}"
         for link in ("uplink", "downlink")
