@@ -162,9 +162,9 @@ class LoopModel:
         """The state from its numbers, shape (size,)."""
         values = row.tolist()
         fixed = ERRORS + DRIVE
-        return ErrorState(
-            *values[:fixed], tuple(values[fixed : fixed + self.states]), tuple(values[fixed + self.states :])
-        )
+        x_e, y_e, theta_e, v, w, a = values[:fixed]
+        states, memory = tuple(values[fixed : fixed + self.states]), tuple(values[fixed + self.states :])
+        return ErrorState(x_e, y_e, theta_e, v, w, a, states, memory)
 
     def drive(self, row: Floats, v_r: Floats, w_r: Floats) -> Floats:
         """The states of a lap that begins with `row`, and the one after it: shape (N + 1, size)."""

@@ -4,8 +4,8 @@ A policy says what the edge makes of a pose that is one step older than it was, 
 pose that the edge took for the AGV's in the step before (`held`), the one that it compared it with (`target`), each
 with x, y [m], theta [rad], and the reference of now with its speeds as well (`reference`: x, y, theta, v, w). It
 returns held and target for now. At a reception `held` is the pose received and `target` the reference of its instant.
-If it names them it also gets the command v [m/s], w [rad/s] that was sent in the step before, the sampling period `ts` [s]
-and `arc`, whether the plant's model moves along arcs. All other arguments are its parameters.
+If it names them it also gets the command v [m/s], w [rad/s] that was sent in the step before, the sampling period `ts`
+[s] and `arc`, whether the plant's model moves along arcs. All other arguments are its parameters.
 """
 
 from __future__ import annotations
