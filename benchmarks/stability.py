@@ -16,8 +16,8 @@ import numpy as np
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario, load_scenario
-from agv_analysis.stability import lifted, paper
-from agv_analysis.stability.linearisation import step_matrices
+from agv_analysis.stability import kanayama_delay, lifted, paper
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.margin_map import around, margin_map
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference.reference import Reference
@@ -42,7 +42,7 @@ def measure() -> list[Comparison]:
     ours = _seconds(5, lambda: paper.spectral_radii(theta, theta_held, v_held, gains, ts))
     loop = _seconds(1, lambda: _one_by_one(theta, theta_held, v_held, gains, ts))
     batched = _seconds(3, lambda: _all_at_once(theta, theta_held, v_held, gains, ts))
-    of_lifted = _seconds(5, lambda: lifted.spectral_radius(N, 1.0, 0.1, gains, ts))
+    of_lifted = _seconds(5, lambda: kanayama_delay.spectral_radius(N, 1.0, 0.1, gains, ts))
     of_companion = _seconds(1, lambda: companion_radius(N, 1.0, 0.1, gains, ts))
     base, axes = around(scenario, ("kx", "ts"), POINTS)
     of_map = _seconds(3, lambda: margin_map(base, ("kx", "ts"), *axes))
@@ -65,7 +65,7 @@ def measure() -> list[Comparison]:
 def _largest_n(scenario: Scenario, kx: float) -> int | None:
     """Largest constant n at one point of the map, by bisection."""
     gains = dataclasses.replace(scenario.controller, kx=kx)
-    return lifted.largest_n(np.ones(1), np.zeros(1), gains, scenario.plant.ts)
+    return lifted.largest_n(kanayama_loop(np.ones(1), np.zeros(1), gains, scenario.plant.ts))
 
 
 def _seconds(tries: int, work: Callable[[], object]) -> float:
@@ -99,11 +99,8 @@ def _all_at_once(theta: Floats, theta_held: Floats, v: Floats, gains: Controller
 
 def companion_radius(n: int, v_r: float, w_r: float, gains: ControllerParameters, ts: float) -> float:
     """Spectral radius of the dense block companion matrix of size 3 (n + 1)."""
-    F, G = step_matrices(np.array([v_r]), np.array([w_r]), gains, ts)
-    lifted_system = np.eye(3 * (n + 1), k=-3)
-    lifted_system[:3, :3] = F[0]
-    lifted_system[:3, -3:] += G[0]
-    return float(np.abs(np.linalg.eigvals(lifted_system)).max())
+    loop = kanayama_loop(np.array([v_r]), np.array([w_r]), gains, ts)
+    return float(np.abs(np.linalg.eigvals(lifted.companion(loop, n))).max())
 
 
 if __name__ == "__main__":

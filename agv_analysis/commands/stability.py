@@ -31,8 +31,8 @@ _SEEDS = 20
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
-    help="Instead: margins over a grid of two of kx, ky, ktheta, ts, v and curvature, each from a tenth to ten times "
-    "the scenario's value.",
+    help="Instead: margins over a grid of two of kx, ky, ktheta, ts, v, curvature and speed_scale, each from a tenth "
+    "to ten times the scenario's value.",
 )  # fmt: skip
 @click.option("--points", type=click.IntRange(2, 1000), default=100, show_default=True, help="Points of each axis.")
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Where the map goes, map.csv by default.")
@@ -118,6 +118,7 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
     """
     from agv_analysis.link.markov_channel import chain_of
     from agv_analysis.stability.gains import WHY_A_TOLERANCE, best_kx
+    from agv_analysis.stability.scenario_loop import loop_of
 
     chain, model = chain_of(scenario.relay.uplink), scenario.relay.uplink.model
     if scenario.error_detector.policy == "predict":
@@ -126,7 +127,7 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
         return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
     if chain.loss_rate >= 1.0:
         return {}, {"best_kx": "no answer: the scenario's uplink loses everything"}
-    return best_kx(chain, scenario.plant.ts), {"almost_sure": WHY_A_TOLERANCE}
+    return best_kx(loop_of(scenario), chain), {"almost_sure": WHY_A_TOLERANCE}
 
 
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:

@@ -16,7 +16,9 @@ from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability import joint_spectral_radius, lifted, mean_square, paper
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margins import binding
+from agv_analysis.stability.scenario_loop import loop_of_run
 from agv_ros.parameters import SHARED
 
 _MOST_POINTS = 1200
@@ -24,6 +26,9 @@ _MOST_POINTS = 1200
 
 _MOST_DOTS = 100
 """Each of them costs a drawing more than twenty points of a line."""
+
+LATER = "see the margins of the lap"
+"""For what takes longer than a move may."""
 
 _PLACES = 100
 """Places of the track at which the lifted system is asked: all of them would take longer than the lap."""
@@ -76,33 +81,42 @@ def beside(panel: Panel, pinned: Panel | None) -> Panel:
 
 
 def summary_rows(run: Run) -> Iterator[tuple[str, str]]:
-    """What a run tells, and the margins that are computed at once: those of a straight track in closed form."""
-    gains, ts, n = run.scenario.controller, run.ts, outages(run).n_ul_max
+    """What a run tells, and the margins that are computed at once: those of a straight track in closed form.
+
+    A loop without closed forms is left to the criteria for the whole lap.
+    """
+    loop, n = loop_of_run(run), outages(run).n_ul_max
     e = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
     late = float(e[-max(1, len(e) // 10) :].max())
     yield "Error in the last tenth", "; ".join((f"at most {late:.3g} m", *run.notes))
-    yield "Oldest pose", f"{n} steps ({n * ts * 1e3:g} ms)"
+    yield "Oldest pose", f"{n} steps ({n * run.ts * 1e3:g} ms)"
     yield "Paper's test", _of_paper(run)
-    v, w = run.reference[:, 3], run.reference[:, 4]
-    predicts = run.scenario.error_detector.policy == "predict"
-    but = ", without the predictor" if predicts else ""
-    if predicts:
-        yield "Pose always that old", "predicted: with an exact model as without outages"
-    else:
-        some = np.arange(0, len(v), max(1, len(v) // _PLACES))  # quarters of a lap that are alike stay so
-        radius = lifted.largest_radius(n, v[some], w[some], gains, ts)
-        yield "Pose always that old", f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
-    top = float(np.abs(v).max())
-    along, across = (
-        joint_spectral_radius.largest_n_along(ts * gains.kx),
-        joint_spectral_radius.largest_n_across(top, gains, ts),
-    )
+    yield "Pose always that old", _of_lifted(loop, n)
+    if loop.closed_form is not None:
+        yield from _of_a_straight_track(loop)
+
+
+def _of_lifted(loop: LinearLoop, n: int) -> str:
+    """Is the loop stable if every pose is as old as the oldest? Where a word on that does not take long."""
+    if loop.is_exact:
+        return "predicted: with an exact model as without outages"
+    if not loop.is_constant and (loop.predicts or loop.closed_form is None):
+        return LATER
+    places = np.arange(0, loop.steps, max(1, loop.steps // _PLACES))  # quarters of a lap that are alike stay so
+    radius = lifted.largest_radius(loop if loop.is_constant else loop.at(places), n)
+    return f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
+
+
+def _of_a_straight_track(loop: LinearLoop) -> Iterator[tuple[str, str]]:
+    """Margins on a straight track at the lap's top speed, of a loop with a closed form."""
+    but = ", without the predictor" if loop.predicts else ""
+    along, across = joint_spectral_radius.largest_n_straight(loop)
     yield "Straight track, any outages", f"up to {_n(along)} along, {_n(across)} across{but}"
-    delay = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(top, gains, ts))
-    yield "Straight track, delay", f"below {delay * ts * 1e3:.4g} ms{but}" if delay > 0.0 else "none"
-    loss = mean_square.critical_loss_along(ts * gains.kx)
+    delay = lifted.critical_delay(loop)
+    yield "Straight track, delay", f"below {delay * loop.ts * 1e3:.4g} ms{but}" if delay > 0.0 else "none"
+    loss = -1.0 if loop.along_gain is None else mean_square.critical_loss_along(loop.along_gain)
     yield "Independent losses, mean square", f"below {loss:.4g}{but}" if loss > 0.0 else "none"
-    binds = binding(top, gains, ts)
+    binds = binding(loop)
     yield "What binds", "nothing" if binds is None else f"the error {binds} the track"
 
 

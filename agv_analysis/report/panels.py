@@ -14,7 +14,7 @@ from agv_analysis.report.overview import SMALLEST, within
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import lifted, paper
 from agv_analysis.stability.analysis import Analysis, Observations, paper_inputs
-from agv_analysis.stability.linearisation import step_matrices
+from agv_analysis.stability.scenario_loop import loop_of_run
 
 TIME = "time [s]"
 
@@ -191,22 +191,11 @@ def paper_eigenvalues(run: Run) -> NDArray[np.complex128]:
 
 
 def lifted_multipliers(analysis: Analysis) -> NDArray[np.complex128]:
-    """Eigenvalues of the lifted system at the speeds where it is worst, shape (3 (n + 1),); none if it is too large.
-
-    e(k+1) = F e(k) + G e(k-n) as a block companion matrix of [e(k), .., e(k-n)].
-    """
-    run, n = analysis.run, analysis.n
-    size = 3 * (n + 1)
-    if size > LARGEST_LIFTED:
+    """Eigenvalues of the lifted system at the speeds where it is worst, shape (m + q n,); none if it is too large."""
+    loop, n = loop_of_run(analysis.run), analysis.n
+    if loop.size + loop.outputs * n > LARGEST_LIFTED:
         return np.empty(0, dtype=np.complex128)
-    gains = run.scenario.controller
-    v, w = lifted.distinct_speeds(run.reference[:, 3], run.reference[:, 4])
-    worst = int(np.argmax(lifted.spectral_radii(n, v, w, gains, run.ts)))
-    F, G = step_matrices(v[[worst]], w[[worst]], gains, run.ts)
-    companion = np.eye(size, k=-3)
-    companion[:3] = 0.0
-    companion[:3, :3] += F[0]
-    companion[:3, -3:] += G[0]
+    companion = lifted.companion(loop.frozen(lifted.worst_step(loop, n)), n)
     return np.asarray(np.linalg.eigvals(companion), dtype=np.complex128)
 
 

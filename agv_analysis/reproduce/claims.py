@@ -14,6 +14,7 @@ from agv_analysis.reproduce.runs import GAINS, LIMIT, Runs, gain, scenario
 from agv_analysis.run import Floats, Run
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.stability import lifted, paper
+from agv_analysis.stability.scenario_loop import loop_along
 
 LOW, MIDDLE, HIGH = GAINS
 LIMITS = {"unlimited": math.inf, "limited": LIMIT}
@@ -79,9 +80,8 @@ def _without_outages(runs: Runs) -> Values:
     found, base = {}, scenario()
     reference = runs.run(*gain(LOW)).reference
     for kx in GAINS:
-        gains = scenario(*gain(kx)).controller
-        radius = lifted.largest_radius(0, reference[:, 3], reference[:, 4], gains, base.plant.ts)
-        found[f"K_x = {kx:g}: growth"] = radius
+        loop = loop_along(scenario(*gain(kx)), reference)
+        found[f"K_x = {kx:g}: growth"] = lifted.largest_radius(loop, 0)
     border = 2.0 / base.plant.ts
     for kx in (border - 1.0, border + 1.0):
         found[f"K_x = {kx:g}: twins"] = _twins(*gain(kx), ON_TRACK, "plant.duration=10.0")

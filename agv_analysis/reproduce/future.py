@@ -23,6 +23,7 @@ from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.single import steps_of
 from agv_analysis.stability import joint_spectral_radius, lifted, mean_square, paper
+from agv_analysis.stability.scenario_loop import loop_along
 
 TO_1_CM = "to 1 cm [steps]"
 SHARE_OF_K_THETA = "K_y / K_theta^2"
@@ -195,11 +196,10 @@ def _criteria_at(track: str, kx: float) -> Values:
     settings = (*gain(kx), ON_TRACK, f"error_detector.track={track}")
     wanted, burst = scenario(*settings), (*settings, "relay.uplink.model=burst")
     reference = reference_of(wanted.error_detector, steps_of(wanted))
-    theta, v_r, w_r = reference[:, 2], reference[:, 3], reference[:, 4]
-    gains, ts = wanted.controller, wanted.plant.ts
-    n_paper = paper.largest_n(theta, v_r, gains, ts)
-    n_bursts, _ = joint_spectral_radius.largest_n(v_r, w_r, gains, ts)
-    n_constant = lifted.largest_n(v_r, w_r, gains, ts)
+    loop = loop_along(wanted, reference)
+    n_paper = paper.largest_n(reference[:, 2], reference[:, 3], wanted.controller, wanted.plant.ts)
+    n_bursts, _ = joint_spectral_radius.largest_n(loop)
+    n_constant = lifted.largest_n(loop)
     return {
         "track": track,
         "K_x [1/s]": kx,
@@ -208,7 +208,7 @@ def _criteria_at(track: str, kx: float) -> Values:
         "constant n, twins": _largest(lambda n: constant_delay.contraction(wanted, n) < CLOSER, n_constant or 0),
         "bursts": n_bursts,
         "bursts, twins": _largest(lambda n: _contracts(*burst, f"relay.uplink.n={n}"), n_bursts or 0),
-        "independent losses, mean square": mean_square.critical_loss(v_r, w_r, gains, ts),
+        "independent losses, mean square": mean_square.critical_loss(loop),
     }
 
 
@@ -218,7 +218,7 @@ def _contracts(*settings: str) -> bool:
 
 
 def _largest(is_stable: Callable[[int], bool], guess: int) -> int:
-    """Largest n that is stable, sought for from a guess on; -1 if not even 0 is."""
+    """Largest n that is stable, searched for from a guess on; -1 if not even 0 is."""
     n = max(0, guess)
     while n >= 0 and not is_stable(n):
         n -= 1

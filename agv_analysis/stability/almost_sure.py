@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli
 from agv_analysis.run import Floats
-from agv_analysis.stability.linearisation import HELD, Edge, reachable, reception_maps, seen, step_matrices
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import crossing
 from agv_analysis.stability.products import orthogonalised_pass
-from agv_cloud.parameters import ControllerParameters
+from agv_analysis.stability.reception_maps import reception_maps
 from agv_plant.random_stream import uniforms
 
 STEPS = 400_000
@@ -40,26 +40,16 @@ class Exponents(NamedTuple):
     errors: Floats
 
 
-def exponents(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, chain: Chain, steps: int = STEPS, seed: int = 1,
-    edge: Edge = HELD,
-) -> Exponents:  # fmt: skip
-    """Lyapunov exponents of laps with the speeds v_r [m/s], w_r [rad/s] of shape (N,), from `steps` steps of losses.
+def exponents(loop: LinearLoop, chain: Chain, steps: int = STEPS, seed: int = 1) -> Exponents:
+    """Lyapunov exponents of laps driven again and again, from `steps` steps of losses.
 
     The standard errors are those of the means of 20 parts of the sequence. Zero without any reception: an open loop.
     """
-    size = reachable(v_r, w_r)
-    F, G = (M[:, :size, :size] for M in step_matrices(v_r, w_r, gains, ts))
-    return _exponents(F, G, chain, steps, seed, edge)
-
-
-def _exponents(F: Floats, G: Floats, chain: Chain, steps: int, seed: int, edge: Edge) -> Exponents:
-    size = F.shape[-1]
+    size = loop.size
     received = np.flatnonzero(~sample_losses(chain, steps, seed))
     if len(received) <= _BATCHES:
         return Exponents(np.zeros(size), np.full(size, math.inf))
-    G, H = seen(F, G, edge)
-    maps = reception_maps(F, G, received, steps, H)
+    maps = reception_maps(loop, received, steps)
     parts = np.array_split(np.arange(len(maps)), _BATCHES)
     lengths = np.diff(np.append(received[[part[0] for part in parts]], steps))
     basis = np.eye(size)
@@ -128,31 +118,27 @@ def critical_loss_along(a: float) -> float | None:
     return None
 
 
-def critical_loss(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, seed: int = 1, edge: Edge = HELD
-) -> float | None:
+def critical_loss(loop: LinearLoop, seed: int = 1) -> float | None:
     """Smallest loss probability at which the top exponent of a lap reaches 0, independent losses.
 
-    -1 if it is not negative even without losses, None if it stays negative up to 0.999. On a straight track along and
-    across are two loops and the former is exact; on others it is found by simulation, good to about 0.002. There the
-    little that a curve turns of one error into the other matters: near the border the error along the track makes
-    such excursions that the loop diverges before the exponent along alone reaches 0.
+    -1 if it is not negative even without losses, None if it stays negative up to 0.999. Where the closed form holds,
+    along and across a straight track are two loops and the former is exact; others are simulated, good to about 0.002.
+    There the little that a curve turns of one error into the other matters: near the border the error along the track
+    makes such excursions that the loop diverges before the exponent along alone reaches 0.
     """
-    F, G = step_matrices(v_r, w_r, gains, ts)
-    if np.any(w_r != 0.0) or edge != HELD:
-        size = reachable(v_r, w_r)
-        return _simulated_critical_loss(F[:, :size, :size], G[:, :size, :size], seed, edge)
-    found = [critical_loss_along(ts * gains.kx)]
-    if np.any(v_r != 0.0):
-        found.append(_simulated_critical_loss(F[:, 1:, 1:], G[:, 1:, 1:], seed, edge))
+    if loop.closed_form is None or loop.predicts or np.any(loop.w_r != 0.0):
+        return _simulated_critical_loss(loop, seed)
+    found = [critical_loss_along(loop.ts * loop.closed_form.kx)]
+    if loop.size > 1:
+        found.append(_simulated_critical_loss(loop.without_along(), seed))
     return min((p for p in found if p is not None), default=None)
 
 
-def _simulated_critical_loss(F: Floats, G: Floats, seed: int, edge: Edge) -> float | None:
+def _simulated_critical_loss(loop: LinearLoop, seed: int) -> float | None:
     """By bisection of the logarithm of the delivery rate; the same random numbers serve every probability."""
 
     def is_stable(delivery: float) -> bool:
-        return bool(_exponents(F, G, bernoulli(1.0 - delivery), STEPS, seed, edge).values[0] < 0.0)
+        return bool(exponents(loop, bernoulli(1.0 - delivery), STEPS, seed).values[0] < 0.0)
 
     high, low = 1.0, 1e-3
     if not is_stable(high):

@@ -21,8 +21,9 @@ from agv_analysis.stability import (
     variable_delay,
 )
 from agv_analysis.stability.joint_spectral_radius import BurstVerdict
-from agv_analysis.stability.linearisation import Edge
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margins import LONGEST, LONGEST_PREDICTED
+from agv_analysis.stability.scenario_loop import loop_of_run
 from agv_analysis.stability.verdict import Verdict, judge, judge_both_links, judge_late
 from agv_ros.errors import UserError
 
@@ -199,27 +200,26 @@ def analyse(run: Run) -> Analysis:
     if not run.gains_known:
         raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
     out, fit = outages(run), fit_channel(run.lost)
-    v_r, w_r, gains = run.reference[:, 3], run.reference[:, 4], run.scenario.controller
-    edge = Edge.of(run.scenario)
-    both = _growth_on_both_links(run, fit, edge)
-    growth = mean_square.lap_growth(v_r, w_r, gains, run.ts, fit.chain, edge=edge) / len(run) if both is None else both
-    of_drops, of_motion = _contractions(run, edge)
-    radius = _lifted_radius(out.n_ul_max, v_r, w_r, run, edge)
+    loop, v_max = loop_of_run(run), run.scenario.controller.v_max
+    both = _growth_on_both_links(run, fit, loop)
+    growth = mean_square.lap_growth(loop, fit.chain) / len(run) if both is None else both
+    of_drops, of_motion = _contractions(run, loop)
+    radius = lifted.largest_radius(loop, out.n_ul_max)
     if _is_late(run):
-        verdict = judge_late(_constant_delay(run), radius, gains.v_max)
+        verdict = judge_late(_constant_delay(run), radius, v_max)
     elif run.downlink_lost.any():
-        verdict = judge_both_links(both, run.scenario.plant.downlink_policy, gains.v_max)
+        verdict = judge_both_links(both, run.scenario.plant.downlink_policy, v_max)
     else:
-        longest = max(out.n_ul_max, LONGEST_PREDICTED) if edge.predicts else LONGEST
-        n_bursts, _ = joint_spectral_radius.largest_n(v_r, w_r, gains, run.ts, longest, edge)
-        verdict = judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, v_r, w_r, run, edge), gains.v_max)
+        longest = max(out.n_ul_max, LONGEST_PREDICTED) if loop.predicts else LONGEST
+        n_bursts, _ = joint_spectral_radius.largest_n(loop, longest)
+        verdict = judge(out.n_ul_max, n_bursts, growth, _burst_left(fit, growth, loop), v_max)
     return Analysis(
         run=run,
         outages=out,
         convergence=convergence(run),
         paper=paper_test(run),
         lifted_radius=radius,
-        bursts=joint_spectral_radius.verdict(out.n_ul_max, v_r, w_r, gains, run.ts, edge),
+        bursts=joint_spectral_radius.verdict(loop, out.n_ul_max),
         fit=fit,
         mean_square_growth=growth,
         floquet=of_drops,
@@ -228,17 +228,13 @@ def analyse(run: Run) -> Analysis:
     )
 
 
-def _growth_on_both_links(run: Run, fit: ChannelFit, edge: Edge) -> float | None:
+def _growth_on_both_links(run: Run, fit: ChannelFit, loop: LinearLoop) -> float | None:
     """Growth of E[e^2] per step under both fitted channels; None if no command was lost, or for other policies."""
     policy = run.scenario.plant.downlink_policy
     if policy not in mean_square_two_links.POLICIES or not run.downlink_lost.any():
         return None
-    down = fit_channel(run.downlink_lost).chain
-    speeds = run.reference[:, 3], run.reference[:, 4]
-    growth = mean_square_two_links.lap_growth(
-        *speeds, run.scenario.controller, run.ts, fit.chain, down, edge, stops=policy == "zero"
-    )
-    return growth / len(run)
+    links = mean_square_two_links.independent(fit.chain, fit_channel(run.downlink_lost).chain)
+    return mean_square_two_links.lap_growth(loop, links, stops=policy == "zero") / len(run)
 
 
 def _is_late(run: Run) -> bool:
@@ -257,50 +253,39 @@ def _constant_delay(run: Run) -> int | None:
     return n if is_direct and np.array_equal(run.n_ul, np.minimum(run.k, n)) else None
 
 
-def _lifted_radius(n: int, v_r: Floats, w_r: Floats, run: Run, edge: Edge) -> float:
-    gains = run.scenario.controller
-    if edge.predicts and not edge.is_exact:
-        return float(np.exp(floquet.constant_delay(n, v_r, w_r, gains, run.ts, edge) / len(run)))
-    return lifted.largest_radius(0 if edge.is_exact else n, v_r, w_r, edge.felt(gains), run.ts)
-
-
-def _burst_left(fit: ChannelFit, growth: float, v_r: Floats, w_r: Floats, run: Run, edge: Edge) -> float | None:
+def _burst_left(fit: ChannelFit, growth: float, loop: LinearLoop) -> float | None:
     """By what factor the mean burst may grow at the fitted loss rate; None for a fit without bursts."""
     if fit.model != "gilbert_elliott" or growth >= 0.0 or fit.chain.loss_rate >= 1.0:
         return None
-    critical = mean_square.critical_burst(fit.chain.loss_rate, v_r, w_r, run.scenario.controller, run.ts, edge)
+    critical = mean_square.critical_burst(loop, fit.chain.loss_rate)
     return critical / fit.mean_burst if np.isfinite(critical) else None
 
 
-def _contractions(run: Run, edge: Edge) -> tuple[float | None, float | None]:
+def _contractions(run: Run, loop: LinearLoop) -> tuple[float | None, float | None]:
     """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
     if _is_late(run):
-        return _late_contraction(run, edge), None
+        return _late_contraction(run, loop), None
     first = int(np.argmin(run.lost))
     steps = len(run) - first
     if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
         return None, None
-    lost, reference, gains = run.lost[first:], run.reference[first:], run.scenario.controller
-    policy = run.scenario.error_detector.policy
+    lost, gains, align = run.lost[first:], loop.closed_form, run.scenario.error_detector.policy == "align"
     with np.errstate(all="ignore"):
-        of_drops = floquet.drop_sequence(lost, reference[:, 3], reference[:, 4], gains, run.ts, edge)
+        of_drops = floquet.drop_sequence(loop.at(np.arange(first, len(run))), lost, 1)
         of_drops_per_step = _finite(float(np.exp(of_drops[0] / steps)))
-        if policy == "predict":  # whose answers depend on all commands since the pose, not on the pose alone
+        if loop.predicts or gains is None:  # a prediction depends on all commands since the pose, not on it alone
             return of_drops_per_step, None
-        felt = edge.felt(gains)
-        of_motion = floquet.trajectory(run.pose[first:], reference, lost, felt, run.ts, policy == "align")
+        of_motion = floquet.trajectory(run.pose[first:], run.reference[first:], lost, gains, run.ts, align)
     return of_drops_per_step, _finite(float(np.exp(of_motion[0] / steps)))
 
 
-def _late_contraction(run: Run, edge: Edge) -> float | None:
-    """Growth factor per step about the reference from the first step on; None for what `late` does not know."""
+def _late_contraction(run: Run, loop: LinearLoop) -> float | None:
+    """Growth factor per step about the reference from the first step on; None for what `variable_delay` cannot say."""
     is_whole = run.k[0] == 0 and int(run.k[-1]) + 1 == len(run)
-    if edge.predicts or not is_whole or _has_late(run.downlink):
+    if loop.predicts or not is_whole or _has_late(run.downlink):
         return None
     with np.errstate(all="ignore"):
-        growth = variable_delay.age_sequence(
-            run.n_ul, run.reference[:, 3], run.reference[:, 4], run.scenario.controller, run.ts, edge
-        )
+        growth = variable_delay.age_sequence(loop, run.n_ul)
     return _finite(float(np.exp(growth / len(run))))
 
 

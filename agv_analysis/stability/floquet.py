@@ -4,36 +4,37 @@ The lap is a linear periodic system, so this is the exact answer for its very sp
 criteria at frozen speeds are only indications. Growths are given as natural logarithms, because a lap of 20 000 steps
 shrinks errors by hundreds of powers of ten. The loop is stable if the largest one is below 0.
 
-- `constant_delay`: the pose is n steps old at every step (the lifted system of dimension 3 (n+1), never formed), held
+- `constant_delay`: the pose is n steps old at every step (the lifted system of dimension m + q n, never formed), held
   or moved on by the plant's model;
 - `drop_sequence`: the sequence of losses is given, one verdict a step; between receptions it is held, or predicted;
 - `trajectory`: the same about the motion that was really driven, which may be far from the reference.
 
-Where the AGV does not move on the whole lap, only the errors that it can reach count (see `linearisation.reachable`).
+A predictor behind a constant delay. It moves C z(k-n) on under the commands that it sent, so with the innovations
+nu(j) = E_z z(j) + E_h h(j), what a step of the plant does and the model does not know (`LinearLoop.innovation`),
+
+    h(k) = C z(k) - S(k),    S(k) = nu(k-1) + P_h(k-1) nu(k-2) + ... + P_h(k-1) ... P_h(k-n+1) nu(k-n)
+
+z and the last n innovations are the state of the loop. The recursion h(k+1) = P_h h + P_u u + P_h(k) ... P_h(k-n+1)
+nu(k-n) says the same but holds the modes of the model itself as well, which stay for ever and hide those of the loop.
+So S is summed anew: a sliding window as two stacks (the older part summed from its end, the younger from its
+beginning), which costs the same for every n.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
-from agv_analysis.stability.lifted import critical_delay_across, critical_delay_along, spectral_radius
-from agv_analysis.stability.linearisation import (
-    HELD,
-    MARGINAL,
-    Edge,
-    is_constant,
-    loop_jacobians,
-    reachable,
-    reception_maps,
-    seen,
-    step_matrices,
-)
-from agv_analysis.stability.products import growths
+from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radius
+from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
+from agv_analysis.stability.linearisation import loop_jacobians
+from agv_analysis.stability.products import growths, multiply
+from agv_analysis.stability.reception_maps import reception_maps
 from agv_cloud.parameters import ControllerParameters
 
 _COLUMNS = 4
@@ -44,130 +45,171 @@ _LAPS = 40
 _LAPS_OF_DELAY = 5
 """A lap shorter than so many times the delay is driven several times before the subspace is looked at again."""
 
+_STEPS = 1000
+"""Of a loop that is the same at every step so many are driven at least."""
 
-def constant_delay(
-    n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
-) -> float:
+
+def constant_delay(loop: LinearLoop, n: int) -> float:
     """Largest growth (logarithm) over a lap of the error, if the pose is always `n` steps old.
 
-    Speeds v_r [m/s], w_r [rad/s] of shape (N,). By iterating a subspace of the lifted system over laps until its
-    largest Ritz value settles.
+    By iterating a subspace of the lifted system over laps until its largest Ritz value settles.
     """
-    if not edge.predicts:
-        gains = edge.felt(gains)
-        if is_constant(v_r, w_r):
-            return len(v_r) * math.log(spectral_radius(n, float(v_r[0]), float(w_r[0]), gains, ts))
-    size = reachable(v_r, w_r)
-    F, G = (np.ascontiguousarray(M[:, :size, :size]) for M in step_matrices(v_r, w_r, gains, ts))
-    if edge.predicts:
-        F, G = predicted_delay(n, F, G, edge.delta)
-    laps = math.ceil(_LAPS_OF_DELAY * (n + 1) / len(v_r))
-    if laps > 1:
-        F, G = np.tile(F, (laps, 1, 1)), np.tile(G, (laps, 1, 1))
-    columns = min(_COLUMNS, size * (n + 1))
-    window = np.random.default_rng(0).standard_normal((n + 1, size, columns))
-    growth = math.nan
+    n = 0 if loop.is_exact else n
+    is_held = not loop.predicts or loop.is_exact
+    if is_held and loop.closed_form is not None and loop.is_constant:
+        v, w = float(loop.v_r[0]), float(loop.w_r[0])
+        return loop.steps * math.log(spectral_radius(n, v, w, loop.closed_form, loop.ts))
+    least = _LAPS_OF_DELAY * (n + 1)
+    steps = max(least, _STEPS) if loop.is_constant else math.ceil(least / loop.steps) * loop.steps
+    size, q = loop.size, loop.outputs
+    columns = min(_COLUMNS, size + q * n)
+    state = np.random.default_rng(0).standard_normal((size + q * n, columns))
+    drive, growth = _drive(loop, is_held, steps), math.nan
     for _ in range(_LAPS):
-        basis, _ = np.linalg.qr(window.reshape(-1, columns))
-        window = basis.reshape(window.shape).copy()
-        log_scale = compiled(_drive_lap)(F, G, window)
-        ritz = np.abs(np.linalg.eigvals(basis.T @ window.reshape(-1, columns))).max()
+        basis, _ = np.linalg.qr(state)
+        z, past = basis[:size].copy(), basis[size:].reshape(n, q, columns).copy()
+        log_scale = drive(z, past)
+        state = np.concatenate((z, past.reshape(-1, columns)))
+        ritz = np.abs(np.linalg.eigvals(basis.T @ state)).max()
         before, growth = growth, log_scale + math.log(ritz) if ritz > 0.0 else -math.inf
         if growth == before or abs(growth - before) <= 1e-10 * max(1.0, abs(growth)):
             break
-    return growth / laps
+    return growth * (loop.steps / steps)
 
 
-def predicted_delay(n: int, F: Floats, G: Floats, delta: float) -> tuple[Floats, Floats]:
-    """F' and G' of h(k+1) = F'(k) h(k) + G'(k) h(k-n): the predicted error h, if the pose is always `n` steps old.
+def _drive(loop: LinearLoop, is_held: bool, steps: int) -> Callable[[Floats, Floats], float]:
+    """Sends z, shape (m, columns), and what is kept of the last n steps, (n, q, columns), through so many steps.
 
-    The edge moves the pose on under the commands that it sent, which it computed from earlier predictions. What it does
-    not know is the plant's share D = G_true - G of them: h(k) = e(k) - sum_{j=k-n}^{k-1} F(k-1) ... F(j+1) D(j) h(j).
-    Together with e(k+1) = F(k) e(k) + (G + D)(k) h(k) the sum telescopes to
-
-        h(k+1) = (F + G)(k) h(k) + F(k) ... F(k-n+1) D(k-n) h(k-n)
-
-    so an exact model leaves the loop without outages, and along a straight track, where F = 1 and D = -a delta, every
-    delay is survived as long as |delta| < 1 and a <= 1. Rows of F and G, shape (N, m, m), are the steps of a lap.
+    Oldest first; in place, to be multiplied by exp(what it returns).
     """
-    steps = np.arange(len(F))
-    unknown = delta * G[(steps - n) % len(F), :, 0]
-    for i in range(n):
-        unknown = np.einsum("kij,kj->ki", F[(steps - n + 1 + i) % len(F)], unknown)
-    delayed = np.zeros_like(G)
-    delayed[:, :, 0] = unknown
-    return F + G, delayed
+    if is_held or loop.innovation is None or loop.P_h is None:
+        return lambda z, past: float(compiled(_drive_held)(loop.F, loop.G, steps, z, past))
+    matrices = (loop.F, loop.G, np.ascontiguousarray(loop.P_h), *loop.innovation)
+    return lambda z, past: float(compiled(_drive_predicted)(*matrices, steps, z, past))
 
 
-def largest_constant_delay(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 10_000, edge: Edge = HELD
-) -> int | None:
-    """Largest constant n for which the lap contracts the error; -1 if not even 0 does, None if all up to `limit` do.
-
-    Arguments as of `constant_delay`. The closed forms for a straight track at the mean speed say where to look.
-    """
-
-    def contracts(n: int) -> bool:
-        return constant_delay(n, v_r, w_r, gains, ts, edge) < MARGINAL * len(v_r)
-
-    mean, a = float(np.abs(v_r).mean()), ts * edge.felt(gains).kx
-    guess = 0.0 if edge.predicts else min(critical_delay_along(a), critical_delay_across(mean, gains, ts), limit)
-    stable, step = math.ceil(guess) - 1, 1
-    while stable >= 0 and not contracts(stable):
-        stable, step = max(-1, stable - step), 2 * step
-    unstable, step = stable + 1, 1
-    while unstable <= limit and contracts(unstable):
-        stable, unstable, step = unstable, unstable + step, 2 * step
-    if unstable > limit:
-        return None
-    while unstable - stable > 1:
-        middle = (stable + unstable) // 2
-        stable, unstable = (middle, unstable) if contracts(middle) else (stable, middle)
-    return stable
-
-
-def _drive_lap(F: Floats, G: Floats, window: Floats) -> float:
-    """Send the last n + 1 errors, shape (n + 1, m, columns), oldest first, through a lap; in place.
-
-    What is left in `window` is to be multiplied by exp(return value).
-    """
-    length, size, columns = window.shape
+def _drive_held(F: Floats, G: Floats, steps: int, z: Floats, past: Floats) -> float:
+    """As `_drive` says, of a loop whose pose is held; `past` has the errors h(k-n) .. h(k-1)."""
+    (n, q, columns), m = past.shape, z.shape[0]
+    ring, fresh = np.empty((n + 1, q, columns)), np.empty_like(z)
+    ring[:n], ring[n] = past, z[:q]
     log_scale, oldest = 0.0, 0
-    fresh = np.empty((size, columns))
-    for k in range(F.shape[0]):
-        newest = oldest - 1 if oldest > 0 else length - 1
+    for k in range(steps):
+        row = k % F.shape[0]
         largest = 0.0
-        for i in range(size):
+        for i in range(m):
             for j in range(columns):
                 value = 0.0
-                for m in range(size):
-                    value += F[k, i, m] * window[newest, m, j] + G[k, i, m] * window[oldest, m, j]
+                for p in range(m):
+                    value += F[row, i, p] * z[p, j]
+                for p in range(q):
+                    value += G[row, i, p] * ring[oldest, p, j]
                 fresh[i, j] = value
                 largest = max(largest, abs(value))
-        window[oldest] = fresh
-        oldest = oldest + 1 if oldest + 1 < length else 0
+        z[:], ring[oldest] = fresh, fresh[:q]
+        oldest = oldest + 1 if oldest < n else 0
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            window /= largest
+            z /= largest
+            ring /= largest
             log_scale += math.log(largest)
-    window[:] = np.concatenate((window[oldest:], window[:oldest]))
+    for i in range(n):
+        past[i] = ring[(oldest + i) % (n + 1)]
     return log_scale
 
 
-def drop_sequence(
-    lost: NDArray[np.bool_], v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
-) -> Floats:
-    """Growths (logarithms) over the recorded steps of the three directions of the error, largest first, shape (m,).
+def _drive_predicted(
+    F: Floats, G: Floats, P: Floats, E_z: Floats, E_h: Floats, steps: int, z: Floats, past: Floats
+) -> float:
+    """As `_drive` says, behind a predictor; `past` has the innovations nu(k-n) .. nu(k-1).
 
-    `lost` of shape (N,) says which updates were lost at the steps whose speeds are v_r [m/s], w_r [rad/s]; the sequence
-    is taken as if driven again and again. 0 for each direction if no update was ever received: an open loop.
+    With b the step at which the older part of the window ends: S(k) = P(k-1) .. P(b) older(k-n) + younger.
     """
-    size = reachable(v_r, w_r)
+    (n, q, columns), rows = past.shape, F.shape[0]
+    older, younger, S, h = np.zeros((n + 1, q, columns)), np.zeros((q, columns)), np.zeros((q, columns)), z[:q].copy()
+    since, product, fresh = np.eye(q), np.eye(q), np.empty_like(z)
+    log_scale, at = 0.0, n
+    for k in range(steps):
+        if n > 0:
+            if at == n or k == 0:  # all that is in the window is in `past`, in order
+                at = 0
+                younger[:], since[:] = 0.0, np.eye(q)
+                for i in range(n - 1, -1, -1):
+                    older[i] = older[i + 1]
+                    multiply(since, past[i], False, older[i], True)
+                    multiply(since, P[(k - n + i) % rows], False, product, False)
+                    since[:] = product
+                since[:] = np.eye(q)
+            S[:] = younger
+            multiply(since, older[at], False, S, True)
+        h[:] = z[:q] - S
+        row = k % rows
+        multiply(F[row], z, False, fresh, False)
+        multiply(G[row], h, False, fresh, True)
+        if n > 0:
+            nu = past[at]
+            multiply(E_z[row], z, False, nu, False)
+            multiply(E_h[row], h, False, nu, True)
+            multiply(P[row], younger, False, S, False)
+            younger[:] = S + nu
+            multiply(P[row], since, False, product, False)
+            since[:] = product
+            at += 1
+        z[:] = fresh
+        largest = np.abs(fresh).max()
+        if largest > 1e100 or 0.0 < largest < 1e-100:
+            z /= largest
+            past /= largest
+            older /= largest
+            younger /= largest
+            log_scale += math.log(largest)
+    at %= max(1, n)
+    past[:] = np.concatenate((past[at:], past[:at]))
+    return log_scale
+
+
+def largest_constant_delay(loop: LinearLoop, limit: int = 10_000) -> int | None:
+    """Largest constant n for which the lap contracts the error; -1 if not even 0 does, None if all up to `limit` do.
+
+    The closed forms for a straight track at the mean speed say where to look, if there are any.
+    """
+    guess = 0.0
+    if not loop.predicts and loop.along_gain is not None:
+        guess = min(critical_delay_along(loop.along_gain), limit)
+        if loop.closed_form is not None:
+            mean = float(np.abs(loop.v_r).mean())
+            guess = min(guess, critical_delay_across(mean, loop.closed_form, loop.ts))
+    return last_stable(lambda n: constant_delay(loop, n) < MARGINAL * loop.steps, guess, limit)
+
+
+def last_stable(is_stable: Callable[[int], bool], guess: float, limit: int) -> int | None:
+    """Largest n that is stable, searched for about a guess; -1: not even 0 is, None: all that was tried up to `limit`.
+
+    Taken for granted is that from the first n that is not stable on none is.
+    """
+    stable, step = math.ceil(guess) - 1, 1
+    while stable >= 0 and not is_stable(stable):
+        stable, step = max(-1, stable - step), 2 * step
+    unstable, step = stable + 1, 1
+    while is_stable(unstable):
+        if unstable >= limit:
+            return None
+        stable, unstable, step = unstable, min(unstable + step, limit), 2 * step
+    while unstable - stable > 1:
+        middle = (stable + unstable) // 2
+        stable, unstable = (middle, unstable) if is_stable(middle) else (stable, middle)
+    return stable
+
+
+def drop_sequence(loop: LinearLoop, lost: NDArray[np.bool_], count: int | None = None) -> Floats:
+    """Growths (logarithms) over a lap of the directions of the state, largest first, shape (m,), or only the largest.
+
+    `lost` of shape (N,) says which updates were lost; lap and sequence are taken as if driven again and again. 0 for
+    each direction if no update was ever received: an open loop.
+    """
     received = np.flatnonzero(~lost)
     if not len(received):
-        return np.zeros(size)
-    F, G = (M[:, :size, :size] for M in step_matrices(v_r, w_r, gains, ts))
-    G, H = seen(F, G, edge)
-    return growths(reception_maps(F, G, received, received[0] + len(lost), H))
+        return np.zeros(count or loop.size)
+    return growths(reception_maps(loop, received, received[0] + len(lost)), count)
 
 
 def trajectory(
@@ -181,11 +223,17 @@ def trajectory(
     """As `drop_sequence`, linearised about the motion that was driven instead of about the reference.
 
     X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`; the policy is `hold` or, with `align`,
-    that. The growths are those of a displacement of the whole run, in [m, m, rad] of the map.
+    that. The growths are those of a displacement of the whole run, in [m, m, rad] of the map. For Kanayama's law on
+    Euler's unicycle.
     """
     age = np.arange(len(lost)) - np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
     taken = np.arange(len(lost)) - age
     if align:
         reference = np.hstack((reference[taken, :3], reference[:, 3:]))
     now, outdated = loop_jacobians(pose, pose[taken], reference, gains, ts)
-    return growths(reception_maps(now, outdated, np.flatnonzero(age == 0), len(lost)))
+    nothing = np.zeros((len(lost), 3, 2))
+    driven = LinearLoop(
+        ts, reference[:, 3], reference[:, 4], A=now, B=nothing, D=outdated, L_h=nothing.swapaxes(1, 2),
+        L_z=nothing.swapaxes(1, 2),
+    )  # fmt: skip
+    return growths(reception_maps(driven, np.flatnonzero(age == 0), len(lost)))

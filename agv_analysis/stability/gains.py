@@ -1,6 +1,6 @@
 """The best gain K_x, by what one wants of it: the error along a straight track, which K_x alone governs.
 
-With a = T_s K_x the objectives are rates per step, the smaller the better:
+With a = T_s K_x, K_x times true over commanded speed, the objectives are rates per step, the smaller the better:
 
     no outages        |1 - a|                          a = 1: deadbeat
     delay             largest root of z^n (z - 1) + a  a = n^n / (n+1)^(n+1): the two largest roots meet
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import along_spectral_radius
 
 TOLERANCE = 0.1
@@ -78,8 +79,11 @@ def _antiderivative(u: Floats) -> Floats:
     return np.asarray(u * np.log(np.abs(u), where=u != 0.0, out=np.zeros_like(u)) - u)
 
 
-def best_kx(chain: Chain, ts: float) -> dict[str, float]:
-    """Best K_x [1/s] by objective under a channel; delay and bursts for its mean burst, rounded up."""
+def best_kx(loop: LinearLoop, chain: Chain) -> dict[str, float]:
+    """Best K_x [1/s] by objective under a channel; delay and bursts for its mean burst, rounded up.
+
+    Of the loop counts only how far a command moves the AGV along the track, not the gain that it has.
+    """
     n = math.ceil(chain.mean_burst - 1e-9)
     best = {
         "no_outages": 1.0,
@@ -88,7 +92,7 @@ def best_kx(chain: Chain, ts: float) -> dict[str, float]:
         "mean_square": best_in_mean_square(chain)[0],
         "almost_sure": best_almost_surely(chain)[0],
     }
-    return {objective: a / ts for objective, a in best.items()}
+    return {objective: a / loop.advance for objective, a in best.items()}
 
 
 def minimum(f: Callable[[float], float], low: float, high: float) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """Arbitrary bursts: between two receptions up to n_max updates are lost, in any order and as often as nature likes.
 
-The error goes from one reception to the next by one of the maps M_1 .. M_L, L = n_max + 1 (see `linearisation`), so the
+The state goes from one reception to the next by one of the maps M_1 .. M_L, L = n_max + 1 (`reception_maps`), so the
 loop is a switched system and stable if the joint spectral radius of the maps is below 1. It is bounded from both sides:
 
 - below, by what one sequence does: a lap driven with bursts of equal length, for each length;
@@ -22,22 +22,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from agv_analysis.run import Floats
-from agv_analysis.stability.linearisation import (
-    HELD,
-    MARGINAL,
-    Edge,
-    burst_maps,
-    is_constant,
-    reachable,
-    seen,
-    step_matrices,
-)
+from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import log_spectral_radius
+from agv_analysis.stability.reception_maps import burst_maps
 from agv_cloud.parameters import ControllerParameters
 
 STABLE = "stable"
@@ -55,55 +46,54 @@ class BurstVerdict:
     lower: float
     """Largest growth per step that a sequence was found to have: a lower bound on the joint spectral radius."""
     upper: float
-    """Upper bound on it, inf where no common norm was sought or found."""
+    """Upper bound on it, inf where no common norm was searched for or found."""
     worst: int
     """Burst length (lost updates) whose repetition gives `lower`."""
     certificate: Floats | None
-    """P of the common norm x' P x behind `upper`, shape (m, m); m = 3 unless the AGV is parked throughout."""
+    """P of the common norm z' P z behind `upper`, shape (m, m)."""
 
 
-def verdict(
-    n_max: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
-) -> BurstVerdict:
-    """Verdict for arbitrary bursts up to `n_max` >= 0 on a lap with the speeds v_r [m/s], w_r [rad/s] of shape (N,)."""
-    lap = _lap(v_r, w_r, gains, ts, edge)
-    growth = list(_repeated_growths(lap, n_max + 1))
+def verdict(loop: LinearLoop, n_max: int) -> BurstVerdict:
+    """Verdict for arbitrary bursts of up to `n_max` >= 0 losses on a lap."""
+    growth = list(_repeated_growths(loop, n_max + 1))
     worst = int(np.argmax(growth))
     lower = math.exp(growth[worst])
     if growth[worst] > MARGINAL:
         return BurstVerdict(n_max, UNSTABLE, lower, math.inf, worst, None)
-    certificate = _common_norm(_sample(lap, np.abs(v_r), n_max + 1))
+    certificate = _common_norm(_sample(loop, n_max + 1))
     if certificate is None:
         return BurstVerdict(n_max, UNDECIDED, lower, math.inf, worst, None)
-    upper = math.exp(_worst_growth(lap, n_max + 1, certificate))
+    upper = math.exp(_worst_growth(loop, n_max + 1, certificate))
     return BurstVerdict(n_max, STABLE if upper < 1.0 else UNDECIDED, lower, upper, worst, certificate)
 
 
-def largest_n(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 1000, edge: Edge = HELD
-) -> tuple[int | None, int | None]:
-    """(largest n_max that is proved stable, smallest n that is proved unstable) on a lap; arguments as of `verdict`.
+def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | None]:
+    """(largest n_max that is proved stable, smallest n that is proved unstable) on a lap.
 
     The first is -1 if not even a loop without losses is proved stable, the second None if there is none up to `limit`;
     both None: stable up to `limit`. They are neighbours unless what lies between them is undecided.
     """
-    refuted = next(
-        (
-            n
-            for n, growth in enumerate(_repeated_growths(_lap(v_r, w_r, gains, ts, edge), limit + 1))
-            if growth > MARGINAL
-        ),
-        None,
-    )
+    refuted = next((n for n, growth in enumerate(_repeated_growths(loop, limit + 1)) if growth > MARGINAL), None)
     proved, beyond = -1, limit + 1 if refuted is None else refuted
     attempt = beyond - 1  # just below what is refuted: nearly always proved at once
     while proved < beyond - 1:
-        if verdict(attempt, v_r, w_r, gains, ts, edge).verdict == STABLE:
+        if verdict(loop, attempt).verdict == STABLE:
             proved = attempt
         else:
             beyond = attempt
         attempt = (proved + beyond) // 2
     return (None if proved == limit else proved), refuted
+
+
+def largest_n_straight(loop: LinearLoop) -> tuple[int | None, int | None]:
+    """(along, across): largest n whose repetition contracts on a straight track at the lap's top speed.
+
+    -1 if not even a loop without losses contracts, None if there is no limit. For a loop with a closed form.
+    """
+    if loop.closed_form is None:
+        raise ValueError("bursts on a straight track have a closed form for Kanayama's law on Euler's unicycle alone")
+    along = largest_n_along(loop.ts * loop.closed_form.kx)
+    return along, largest_n_across(loop.top_speed, loop.closed_form, loop.ts)
 
 
 def largest_n_along(a: float) -> int | None:
@@ -125,33 +115,13 @@ def largest_n_across(v: float, gains: ControllerParameters, ts: float) -> int | 
     return max(-1, math.ceil(longest) - 2)
 
 
-class _Lap(NamedTuple):
-    """The steps of a lap (see `linearisation`), of what the AGV can reach alone; one row where speeds are constant."""
-
-    F: Floats
-    G: Floats
-    H: Floats | None
-
-    def maps(self, longest: int) -> Iterator[Floats]:
-        """The maps of bursts of 1 .. `longest` steps."""
-        return burst_maps(self.F, self.G, longest, self.H)
-
-
-def _lap(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge) -> _Lap:
-    if is_constant(v_r, w_r):
-        v_r, w_r = v_r[:1], w_r[:1]
-    size = reachable(v_r, w_r)
-    F, G = (M[:, :size, :size] for M in step_matrices(v_r, w_r, gains, ts))
-    return _Lap(F, *seen(F, G, edge))
-
-
-def _repeated_growths(lap: _Lap, longest: int) -> Iterator[float]:
+def _repeated_growths(loop: LinearLoop, longest: int) -> Iterator[float]:
     """Growth (logarithm, per step) of the sequence that repeats bursts of L steps, for L = 1 .. longest.
 
     The last burst of a lap is cut short by its end.
     """
-    steps, shorter = len(lap.F), [np.broadcast_to(np.eye(lap.F.shape[-1]), lap.F.shape)]
-    for length, M in enumerate(lap.maps(longest), start=1):
+    steps, shorter = len(loop.F), [np.broadcast_to(np.eye(loop.size), loop.F.shape)]
+    for length, M in enumerate(burst_maps(loop, longest), start=1):
         if steps == 1:
             yield log_spectral_radius(M) / length
             continue
@@ -163,18 +133,20 @@ def _repeated_growths(lap: _Lap, longest: int) -> Iterator[float]:
         yield log_spectral_radius(factors) / steps
 
 
-def _sample(lap: _Lap, speed: Floats, longest: int) -> Floats:
+def _sample(loop: LinearLoop, longest: int) -> Floats:
     """Maps of all burst lengths from a few dozen steps at which the AGV moves, shape (M, m, m)."""
-    moving = np.flatnonzero(speed > 0.05 * speed.max()) if len(lap.F) > 1 else np.zeros(1, dtype=np.int64)
+    if loop.is_constant:
+        return np.concatenate(list(burst_maps(loop, longest)))
+    moving = np.flatnonzero(np.abs(loop.v_r) > 0.05 * loop.top_speed)
     moving = moving[:: max(1, len(moving) // 48)]
-    return np.concatenate([M[moving] for M in lap.maps(longest)])
+    return np.concatenate([M[moving] for M in burst_maps(loop, longest)])
 
 
 def _common_norm(maps: Floats) -> Floats | None:
     """P > 0 with M' P M < P for each of the maps, shape (M, m, m); None if the search ends without one.
 
     The ellipsoid method with deep cuts (Bland, Goldfarb and Todd, Oper. Res. 29, 1981) over the entries of P. First P
-    without terms that couple along and across is sought for: it stays a norm that never grows while the AGV is parked.
+    without terms that couple along and across is searched for: it is a norm that never grows while the AGV is parked.
     """
     size = maps.shape[-1]
     entries = [(i, j) for i in range(size) for j in range(i, size)]
@@ -225,16 +197,16 @@ def _violation(maps: Floats, P: Floats) -> tuple[Floats, float] | None:
     return np.outer(y, y) - np.outer(x, x), float(values[worst, -1])
 
 
-def _worst_growth(lap: _Lap, longest: int, P: Floats) -> float:
+def _worst_growth(loop: LinearLoop, longest: int, P: Floats) -> float:
     """Upper bound on the growth (logarithm, per step) of sqrt(x' P x) for any sequence of bursts up to `longest` steps.
 
     With V(k) the largest growth from step k to the end of the lap, V(k) = max_L [log norm of M_L(k) + V(k + L)]. For
     any values W assumed beyond the end, max_k V(k) - W(k) bounds the growth of a lap (Collatz-Wielandt, max-plus).
     """
-    log_norms = np.stack([_log_norms(M, P) for M in lap.maps(longest)], axis=1)
-    if len(lap.F) == 1:
+    log_norms = np.stack([_log_norms(M, P) for M in burst_maps(loop, longest)], axis=1)
+    if loop.is_constant:
         return float((log_norms[0] / np.arange(1, longest + 1)).max())
-    log_norms = np.tile(log_norms, (-(-longest // len(lap.F)), 1))
+    log_norms = np.tile(log_norms, (-(-longest // loop.steps), 1))
     steps = len(log_norms)
     beyond = np.zeros(longest)
     for _ in range(2):

@@ -1,201 +1,106 @@
 """Constant outdatedness: the pose that the edge uses is always n steps old.
 
-The error about the reference obeys e(k+1) = F e(k) + G e(k-n) (see `linearisation`). At speeds that do not change, its
-solutions are z^k with det(z I - F - z^-n G) = 0, which is the characteristic polynomial of the 3 (n+1)-dimensional
-block companion ("lifted") system. With a = T_s K_x, b = T_s v_r K_theta, c = T_s^2 v_r^2 K_y, phi = T_s w_r, u = z^-n:
-
-    D(z) = (z cos phi - 1 + a u) [(z cos phi - 1) (z - 1 + b u) + c u] + z^2 sin^2 phi (z - 1 + b u)
-
-The roots are sought for in sigma = z - 1, in which those near 1 keep their relative accuracy, by Newton's method; no
-matrix of size 3 (n+1) is formed. On |z| = r the outdated term asks for |u| = r^-n, and |u| grows with the distance from
-1; so the largest root of each of the three families (one along the track, two across it) lies on its first branches.
-
-A parked AGV (v_r = 0) cannot move sideways or turn towards the track: the multiplier of what it cannot reach is exactly
-1 whatever the gains. Such neutral multipliers are left out here; whether the lap as a whole contracts is for `floquet`.
+At speeds that do not change the loop is then a linear system with a delay, whose multipliers are the eigenvalues of a
+block companion ("lifted") matrix of size m + q n. Kanayama's law on Euler's unicycle has them in closed form at each
+speed of the track (`kanayama_delay`); any other loop is asked for what a whole lap does (`floquet`).
 """
 
 from __future__ import annotations
 
-import cmath
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
+from agv_analysis.stability import floquet
+from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radii
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_cloud.parameters import ControllerParameters
 
-Complexes = NDArray[np.complex128]
 
-_ANGLES = (0.3, 0.8, 1.3, 1.57, 2.2, 3.0, 4.5, 7.0, 10.0)
-"""Where to start: n times the angle of z. A root of the first branch has it below pi, of the second below 3 pi."""
+def largest_radius(loop: LinearLoop, n: int) -> float:
+    """Largest spectral radius at any speed of the lap, held for ever, for a pose that is always `n` steps old.
 
-_ITERATIONS = 60
-
-
-def spectral_radius(n: int, v_r: float, w_r: float, gains: ControllerParameters, ts: float) -> float:
-    """Largest modulus of a multiplier for constant n at the speeds v_r [m/s], w_r [rad/s]; neutral ones left out."""
-    return float(spectral_radii(n, np.array([v_r]), np.array([w_r]), gains, ts)[0])
-
-
-def spectral_radii(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> Floats:
-    """As `spectral_radius` for speeds of shape (N,), shape (N,)."""
-    a = np.full(len(v_r), ts * gains.kx)
-    b, c = ts * gains.ktheta * v_r, ts * ts * gains.ky * v_r * v_r
-    return radii_of(np.full(len(v_r), float(n)), a, b, c, ts * w_r, v_r == 0.0)
+    In closed form where there is one; else the growth factor per step over the lap. An exact prediction is as good as
+    a fresh pose.
+    """
+    n = 0 if loop.is_exact else n
+    gains = _gains(loop)
+    if gains is None:
+        return math.exp(floquet.constant_delay(loop, n) / loop.steps)
+    v, w = distinct_speeds(loop.v_r, loop.w_r)
+    return float(spectral_radii(n, v, w, gains, loop.ts).max())
 
 
-def radii_of(n: Floats, a: Floats, b: Floats, c: Floats, phi: Floats, parked: NDArray[np.bool_]) -> Floats:
-    """As `spectral_radius` for loops each of its own, by the numbers that D is made of; all of shape (N,)."""
-    loop = _Loop.of(n, a, b, c, phi, parked)
-    starts = _starts(loop)
-    spread = _Loop(*(np.broadcast_to(values, starts.shape).ravel() for values in loop))
-    sigma = _newton(starts.ravel(), spread).reshape(starts.shape)
-    return np.asarray(np.nanmax(np.abs(1.0 + sigma), axis=0, initial=0.0))
+def largest_n(loop: LinearLoop, limit: int = 100_000) -> int | None:
+    """Largest constant n at which every speed of the lap, held for ever, is stable; -1: not even 0, None: over `limit`.
+
+    The closed forms for a straight track say where to look, the spectral radius at the lap's speeds decides. Without a
+    closed form the lap as a whole decides, as of `floquet.largest_constant_delay`.
+    """
+    gains = _gains(loop)
+    if gains is None:
+        return floquet.largest_constant_delay(loop, limit)
+    v, w = distinct_speeds(loop.v_r, loop.w_r)
+    return floquet.last_stable(
+        lambda n: float(spectral_radii(n, v, w, gains, loop.ts).max()) < 1.0, min(critical_delay(loop), limit), limit
+    )
 
 
-class _Loop(NamedTuple):
-    """What D depends on, all of the same shape; cos1 = cos phi - 1, sin2 = sin^2 phi."""
+def worst_step(loop: LinearLoop, n: int) -> int:
+    """A step of the lap whose speeds, held for ever, are the worst for a pose that is always `n` steps old.
 
-    n: Floats
-    a: Floats
-    b: Floats
-    c: Floats
-    phi: Floats
-    cos1: Floats
-    sin2: Floats
-    neutral: Floats
-    """How many multipliers are 1 whatever the gains."""
-
-    @classmethod
-    def of(cls, n: Floats, a: Floats, b: Floats, c: Floats, phi: Floats, parked: NDArray[np.bool_]) -> _Loop:
-        sin2 = np.sin(phi) ** 2
-        neutral = np.where(parked, np.where(sin2 != 0.0, 1.0, 2.0), 0.0)
-        return cls(n, a, b, c, phi, -2.0 * np.sin(0.5 * phi) ** 2, sin2, neutral)
+    In closed form where there is one; else the fastest step.
+    """
+    gains = _gains(loop)
+    if gains is None:
+        return int(np.argmax(np.abs(loop.v_r)))
+    _, first = np.unique(_speeds(loop.v_r, loop.w_r), axis=0, return_index=True)
+    radii = spectral_radii(0 if loop.is_exact else n, loop.v_r[first], loop.w_r[first], gains, loop.ts)
+    return int(first[np.argmax(radii)])
 
 
-def _newton(starts: Complexes, loop: _Loop) -> Complexes:
-    """A root sigma of D for each start, without the neutral ones; NaN where none was found. All of shape (M,)."""
-    found = np.full(starts.shape, np.nan, dtype=np.complex128)
-    index, sigma = np.arange(len(starts)), starts
-    with np.errstate(all="ignore"):
-        for _ in range(_ITERATIONS):
-            value, slope = _characteristic(sigma, loop)
-            # Newton's step on D / sigma^neutral, whose roots are those of D without the neutral ones.
-            step = np.where(value == 0.0, 0.0, value / (slope - loop.neutral * value / sigma))
-            sigma = sigma - step
-            close = np.abs(step) <= 1e-6 * np.abs(sigma)
-            usable = close & ((sigma != 0.0) | (loop.neutral == 0.0))
-            found[index[usable]] = sigma[usable]
-            going = np.isfinite(sigma) & (np.abs(step) > 1e-14 * np.abs(sigma))
-            if not going.any():
-                break
-            index, sigma, loop = index[going], sigma[going], _Loop(*(values[going] for values in loop))
-    return found
+def companion(loop: LinearLoop, n: int) -> Floats:
+    """The lifted system of a loop that is the same at every step, for a pose that is always `n` steps old.
+
+    Of (z(k), h(k-1) .. h(k-n)) where the pose is held, of (z(k), nu(k-1) .. nu(k-n)) behind a predictor (see
+    `floquet`): shape (m + q n, m + q n).
+    """
+    m, q = loop.size, loop.outputs
+    z, *past = np.split(np.eye(m + q * n), range(m, m + q * n, q)) if n else [np.eye(m)]
+    now, h = z[:q], past[-1] if past else z[:q]
+    if loop.P_h is not None and loop.innovation is not None:
+        E_z, E_h = (E[0] for E in loop.innovation)
+        window = np.zeros_like(now)
+        for nu in reversed(past):
+            window = loop.P_h[0] @ window + nu
+        h = z[:q] - window
+        now = E_z @ z + E_h @ h
+    return np.asarray(np.concatenate((loop.F[0] @ z + loop.G[0] @ h, *([now, *past[:-1]] if n else []))))
 
 
-def _characteristic(sigma: Complexes, loop: _Loop) -> tuple[Complexes, Complexes]:
-    """D and dD/dz at z = 1 + sigma."""
-    n, a, b, c, _, cos1, sin2, _ = loop
-    z, cos = 1.0 + sigma, 1.0 + cos1
-    u = np.exp(-n * np.log1p(sigma))
-    du = -n * u / z
-    turned, heading = cos * sigma + cos1, sigma + b * u
-    dheading = 1.0 + b * du
-    across, dacross = turned * heading + c * u, cos * heading + turned * dheading + c * du
-    along, dalong = turned + a * u, cos + a * du
-    value = along * across + z * z * sin2 * heading
-    slope = dalong * across + along * dacross + sin2 * (2.0 * z * heading + z * z * dheading)
-    return value, slope
+def _gains(loop: LinearLoop) -> ControllerParameters | None:
+    """The gains of the closed form, where it holds of an outdated pose as well."""
+    return None if loop.predicts and not loop.is_exact else loop.closed_form
 
 
-def _starts(loop: _Loop) -> Complexes:
-    """Where Newton's method starts, shape (starts, N): on the branches of each family, and near its slow real roots."""
-    n, a, b, c, phi = loop.n, loop.a, loop.b, loop.c, loop.phi
-    turn = np.exp(1j * phi)
-    with np.errstate(all="ignore"):
-        starts = []
-        for angle in _ANGLES:
-            direction = np.exp(1j * angle / (n + 1.0))
-            sigma = direction - 1.0
-            for u in (np.abs(sigma) / a, np.abs(sigma * sigma) / np.abs(b * sigma + c)):
-                starts.append(u ** (-1.0 / (n + 1.0)) * direction - 1.0)
-        # To first order u = 1 - n sigma, which leaves a linear equation along the track and a quadratic one across it.
-        starts.append(-a / (1.0 - n * a) + 0j)
-        p, q = b - n * c, 1.0 - n * b
-        root = np.sqrt(p * p - 4.0 * q * c + 0j)
-        starts += [-2.0 * c / (p + root), -2.0 * c / (p - root), (-p - root) / (2.0 * q)]
-        value, slope = _characteristic(np.zeros(len(a), dtype=np.complex128), loop)
-        starts.append(-value / slope)
-        # A fast turn mixes along and across; then the slow roots are near exp(i phi).
-        starts += [turn * np.exp(1j * angle / (n + 1.0)) - 1.0 for angle in (-2.0, -0.7, 0.0, 0.7, 2.0)]
-    return np.array(starts)
+def critical_delay(loop: LinearLoop) -> float:
+    """Delay in steps, a real number, below which a held pose leaves the loop stable on a straight track at top speed.
 
-
-def largest_radius(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> float:
-    """Largest spectral radius over a track's speeds, shape (N,) each; equal speeds are looked at once."""
-    v, w = distinct_speeds(v_r, w_r)
-    return float(spectral_radii(n, v, w, gains, ts).max())
+    For a loop with a closed form.
+    """
+    gains = loop.closed_form
+    if gains is None:
+        raise ValueError("the critical delay between samples is known for Kanayama's law on Euler's unicycle alone")
+    along, across = critical_delay_along(loop.ts * gains.kx), critical_delay_across(loop.top_speed, gains, loop.ts)
+    return min(along, across)
 
 
 def distinct_speeds(v_r: Floats, w_r: Floats) -> tuple[Floats, Floats]:
     """The pairs of speeds of a track without repetitions; +-w_r are one, for left and right are alike."""
-    pairs = np.unique(np.column_stack((v_r, np.abs(w_r))).round(12), axis=0)
+    pairs = np.unique(_speeds(v_r, w_r), axis=0)
     return pairs[:, 0], pairs[:, 1]
 
 
-def largest_n(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, limit: int = 100_000) -> int | None:
-    """Largest constant n at which every speed of a track, held for ever, is stable; -1: not even 0, None: over `limit`.
-
-    The closed forms for a straight track say where to look, the spectral radius at the track's speeds decides.
-    """
-    v, w = distinct_speeds(v_r, w_r)
-
-    def is_stable(n: int) -> bool:
-        return float(spectral_radii(n, v, w, gains, ts).max()) < 1.0
-
-    fastest = float(np.abs(v).max())
-    delay = min(critical_delay_along(ts * gains.kx), critical_delay_across(fastest, gains, ts))
-    stable, step = max(-1, math.ceil(min(delay, limit)) - 1), 1
-    while stable >= 0 and not is_stable(stable):
-        stable, step = max(-1, stable - step), 2 * step
-    unstable, step = stable + 1, 1
-    while is_stable(unstable):
-        if unstable > limit:
-            return None
-        stable, unstable, step = unstable, unstable + step, 2 * step
-    while unstable - stable > 1:
-        middle = (stable + unstable) // 2
-        stable, unstable = (middle, unstable) if is_stable(middle) else (stable, middle)
-    return stable
-
-
-def critical_delay_along(a: float) -> float:
-    """Delay n in steps, a real number, below which z^n (z - 1) + a has all its roots inside the unit circle.
-
-    From a = 2 sin(pi / (2 (2 n + 1))) (Levin and May, Theor. Popul. Biol. 9, 1976), a = T_s K_x. 0 for a >= 2, where no
-    loop is stable, and for a = 0, where the error along the track stays as it is.
-    """
-    return 0.5 * (math.pi / (2.0 * math.asin(0.5 * a)) - 1.0) if 0.0 < a < 2.0 else 0.0
-
-
-def critical_delay_across(v: float, gains: ControllerParameters, ts: float) -> float:
-    """As `critical_delay_along`, across a straight track at the constant speed `v` [m/s]; inf when parked.
-
-    On |z| = 1 the roots of (z-1)^2 + b u (z-1) + c u = 0, u = z^-n, need x = |z-1|^2 with x^2 = b (b - c) x + c^2. This
-    has one positive solution, and the delay follows from the angles of z and u there. 0 where no loop is stable.
-    """
-    b, c = ts * gains.ktheta * v, ts * ts * gains.ky * v * v
-    if v == 0.0:
-        return math.inf
-    if not 0.0 < c < b or 2.0 * b >= 4.0 + c:  # unstable without outages: the roots of sigma^2 + b sigma + c
-        return 0.0
-    p = 0.5 * b * (b - c)
-    x = p + math.sqrt(p * p + c * c)
-    if x >= 4.0:
-        return 0.0
-    angle = 2.0 * math.asin(0.5 * math.sqrt(x))
-    sigma = complex(math.cos(angle), math.sin(angle)) - 1.0
-    u = -sigma * sigma / (b * sigma + c)
-    return (-cmath.phase(u) % (2.0 * math.pi)) / angle
+def _speeds(v_r: Floats, w_r: Floats) -> Floats:
+    return np.asarray(np.column_stack((v_r, np.abs(w_r))).round(12))

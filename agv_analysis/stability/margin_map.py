@@ -1,4 +1,4 @@
-"""Margins over a grid of any two of K_x, K_y, K_theta, T_s, v and the curvature of the track, at constant speed.
+"""Margins over a grid of any two of K_x, K_y, K_theta, T_s, v, curvature and speed scale, at constant speed.
 
 On a straight track they are closed forms. On a curve the largest constant delay comes from the spectral radius of the
 lifted system, by bisection of all points of the grid at once.
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.joint_spectral_radius import largest_n_across, largest_n_along
-from agv_analysis.stability.lifted import critical_delay_across, critical_delay_along, radii_of
+from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, radii_of
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference.reference import Reference, lap_steps
 from agv_ros.errors import UserError
@@ -45,6 +45,13 @@ class Point(NamedTuple):
     """v_r [m/s]."""
     curvature: float
     """w_r / v_r [1/m]."""
+    speed_scale: float = 1.0
+    """True speed over commanded speed."""
+
+    @property
+    def a(self) -> float:
+        """T_s K_x of the true speed."""
+        return self.ts * self.kx * self.speed_scale
 
     @property
     def gains(self) -> ControllerParameters:
@@ -85,7 +92,7 @@ def around(scenario: Scenario, axes: Sequence[str], points: int) -> tuple[Point,
     """
     gains = scenario.controller
     v = float(np.abs(Reference(scenario.error_detector).first(lap_steps(scenario.error_detector))[:, 3]).max())
-    base = Point(gains.kx, gains.ky, gains.ktheta, scenario.plant.ts, v, 0.0)
+    base = Point(gains.kx, gains.ky, gains.ktheta, scenario.plant.ts, v, 0.0, scenario.plant.speed_scale)
     return base, [_range(base, axis, points) for axis in axes]
 
 
@@ -101,8 +108,8 @@ def _known(axis: str) -> str:
 
 
 def largest_repeated_burst(point: Point) -> int:
-    """Largest n such that bursts of n losses, again and again, contract on a straight track (see `bursts`)."""
-    along = largest_n_along(point.ts * point.kx)
+    """Largest n such that bursts of n losses, again and again, contract on a straight track."""
+    along = largest_n_along(point.a)
     if along is None:  # K_x = 0: what is off along the track stays off
         return -1
     across = LIMIT if point.v == 0.0 else largest_n_across(point.v, point.gains, point.ts)
@@ -112,17 +119,17 @@ def largest_repeated_burst(point: Point) -> int:
 def largest_delays(points: Sequence[Point]) -> Ints:
     """Largest constant n that is stable at each point, shape (points,)."""
     n = np.array([_on_a_straight_track(point) for point in points], dtype=np.int64)
-    kx, ky, ktheta, ts, v, curvature = np.array(points).T
-    step = ts * v
+    kx, ky, ktheta, ts, v, curvature, speed_scale = np.array(points).T
+    a, step = ts * kx * speed_scale, ts * v
     curved = np.flatnonzero(step * curvature)
     if len(curved):
-        numbers = (ts * kx, step * ktheta, step * step * ky, step * curvature, v == 0.0)
+        numbers = (a, step * ktheta, step * step * ky, step * curvature, v == 0.0)
         n[curved] = _on_curves(n[curved], *(values[curved] for values in numbers))
     return n
 
 
 def _on_a_straight_track(point: Point) -> int:
-    along = critical_delay_along(point.ts * point.kx)
+    along = critical_delay_along(point.a)
     across = critical_delay_across(abs(point.v), point.gains, point.ts) if point.v >= 0.0 else 0.0
     # A delay that is a whole number is marginal itself; 1e-9 is more than rounding makes of it.
     return max(-1, math.ceil(min(along, across, LIMIT) - 1e-9) - 1)
@@ -187,5 +194,5 @@ def draw(path: Path, found: MarginMap) -> None:
 
 LABELS = {
     "kx": "K_x [1/s]", "ky": "K_y [1/m^2]", "ktheta": "K_theta [1/m]", "ts": "T_s [s]", "v": "v_r [m/s]",
-    "curvature": "curvature [1/m]",
+    "curvature": "curvature [1/m]", "speed_scale": "true over commanded speed",
 }  # fmt: skip

@@ -6,12 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from agv_analysis.link.markov_channel import chain_of
-from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability import (
     almost_sure,
     floquet,
@@ -21,9 +17,8 @@ from agv_analysis.stability import (
     mean_square_two_links,
     paper,
 )
-from agv_analysis.stability.linearisation import HELD, Edge
-from agv_cloud.parameters import ControllerParameters
-from agv_cloud.reference.reference import lap_steps
+from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.scenario_loop import lap_of, loop_along
 from agv_plant.parameters import ChannelParameters, PlantParameters
 from agv_ros.parameters import SHARED, as_dict
 
@@ -144,54 +139,61 @@ def margins(scenario: Scenario) -> Margins:
     They are those of the loop linearised about its reference: a limit on the speed bounds what is unstable, it does
     not stabilise it.
     """
-    ts, gains, reasons = scenario.plant.ts, scenario.controller, {}
-    reference = reference_of(scenario.error_detector, _lap(scenario))
-    theta, v_r, w_r = reference[:, 2], reference[:, 3], reference[:, 4]
-    n_paper = paper.largest_n(theta, v_r, gains, ts)
+    reasons: dict[str, str] = {}
+    lap = lap_of(scenario)
+    loop = loop_along(scenario, lap)
+    n_paper = paper.largest_n(lap[:, 2], lap[:, 3], scenario.controller, loop.ts)
     if n_paper is None:
         reasons["n_max.paper"] = (
             "no bound: the test holds for every n, since it sees an outdated pose only by how far it has turned"
         )
-    edge = Edge.of(scenario)
-    true = edge.felt(gains)
-    n_lifted = _largest_constant_delay(v_r, w_r, gains, ts, edge, reasons)
-    longest = LONGEST_PREDICTED if edge.predicts else LONGEST
-    n_bursts, refuted = joint_spectral_radius.largest_n(v_r, w_r, gains, ts, longest, edge)
+    n_lifted = _largest_constant_delay(loop, reasons)
+    longest = LONGEST_PREDICTED if loop.predicts else LONGEST
+    n_bursts, refuted = joint_spectral_radius.largest_n(loop, longest)
     if n_bursts is None:
         reasons["n_max.bursts"] = f"no bound: every burst that was tried contracts, up to {longest} slots"
     elif refuted is not None and refuted > n_bursts + 1:
         reasons["n_max.bursts"] = f"proved up to {n_bursts}, refuted from {refuted} on, between them undecided"
-    p_mean_square = _none_below_zero(mean_square.critical_loss(v_r, w_r, gains, ts, edge), "p_max.mean_square", reasons)
-    if p_mean_square is not None and p_mean_square > mean_square.MOST_LOST:
-        p_mean_square = None
-        reasons["p_max.mean_square"] = (
-            f"no bound: the mean square dies out at every loss probability up to {mean_square.MOST_LOST}"
-        )
-    p_almost_sure = almost_sure.critical_loss(v_r, w_r, gains, ts, edge=edge)
-    if p_almost_sure is not None:
-        p_almost_sure = _none_below_zero(p_almost_sure, "p_max.almost_sure", reasons)
-    else:
-        reasons["p_max.almost_sure"] = "no bound: almost every run converges at every loss probability up to 0.999"
-    if almost_sure.is_degenerate(ts * gains.kx) and not np.any(w_r) and edge == HELD:
-        reasons.setdefault(
-            "p_max.almost_sure",
-            "1 / (T_s K_x) is an integer: on a straight track some burst brings the error along it to 0 at one stroke",
-        )
-    loss_rate, burst = _burst(scenario, v_r, w_r, edge, reasons)
+    loss_rate, burst = _burst(scenario, loop, reasons)
     return Margins(
         n_paper=n_paper,
         n_lifted=n_lifted,
         n_bursts=n_bursts,
-        p_mean_square=p_mean_square,
-        p_almost_sure=p_almost_sure,
+        p_mean_square=_p_mean_square(loop, reasons),
+        p_almost_sure=_p_almost_sure(loop, reasons),
         loss_rate=loss_rate,
         burst_mean_square=burst,
-        delay=_delay(float(np.abs(v_r).max()), true, ts, edge, reasons),
-        both_links=_both_links(scenario, v_r, w_r, edge, reasons),
-        binding=_binding_of(edge, n_bursts, float(np.abs(v_r).max()), true, ts),
+        delay=_delay(loop, reasons),
+        both_links=_both_links(scenario, loop, reasons),
+        binding=_binding_of(loop, n_bursts),
         reasons=reasons,
         left_out=left_out(scenario),
     )
+
+
+def _p_mean_square(loop: LinearLoop, reasons: dict[str, str]) -> float | None:
+    name = "p_max.mean_square"
+    found = _none_below_zero(mean_square.critical_loss(loop), name, reasons)
+    if found is not None and found > mean_square.MOST_LOST:
+        reasons[name] = f"no bound: the mean square dies out at every loss probability up to {mean_square.MOST_LOST}"
+        return None
+    return found
+
+
+def _p_almost_sure(loop: LinearLoop, reasons: dict[str, str]) -> float | None:
+    name = "p_max.almost_sure"
+    found = almost_sure.critical_loss(loop)
+    if found is not None:
+        found = _none_below_zero(found, name, reasons)
+    else:
+        reasons[name] = "no bound: almost every run converges at every loss probability up to 0.999"
+    gains = loop.closed_form
+    if gains is not None and not loop.predicts and not loop.w_r.any() and almost_sure.is_degenerate(loop.ts * gains.kx):
+        reasons.setdefault(
+            name,
+            "1 / (T_s K_x) is an integer: on a straight track some burst brings the error along it to 0 at one stroke",
+        )
+    return found
 
 
 def left_out(scenario: Scenario) -> tuple[str, ...]:
@@ -209,31 +211,35 @@ def left_out(scenario: Scenario) -> tuple[str, ...]:
     return (*(f"{name} is {values[name]}" for name in found), *on_top)
 
 
-def _largest_constant_delay(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge, reasons: dict[str, str]
-) -> int | None:
-    limit = 0 if edge.is_exact else LONGEST_DELAY_PREDICTED if edge.predicts else LONGEST_DELAY
-    found = floquet.largest_constant_delay(v_r, w_r, gains, ts, limit, edge)
+def _largest_constant_delay(loop: LinearLoop, reasons: dict[str, str]) -> int | None:
+    limit = 0 if loop.is_exact else LONGEST_DELAY_PREDICTED if loop.predicts else LONGEST_DELAY
+    found = floquet.largest_constant_delay(loop, limit)
     if found is None:
         reasons["n_max.lifted"] = (
             "no bound: an exact prediction is as good as a fresh pose"
-            if edge.is_exact
+            if loop.is_exact
             else f"no bound: the lap contracts for every n that was tried, up to {limit}"
         )
     return found
 
 
-def _binding_of(edge: Edge, n_bursts: int | None, v: float, gains: ControllerParameters, ts: float) -> str | None:
+def _binding_of(loop: LinearLoop, n_bursts: int | None) -> str | None:
     """As `binding`; behind a predictor the error along the track, since the model is wrong in that speed alone."""
-    if edge.predicts:
+    if loop.closed_form is None:
+        return None
+    if loop.predicts:
         return None if n_bursts is None else ALONG
-    return binding(v, gains, ts)
+    return binding(loop)
 
 
-def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
-    """Which error bursts blow up first at the speed `v` [m/s]: along or across the track; None if neither ever."""
-    along = joint_spectral_radius.largest_n_along(ts * gains.kx)
-    across = joint_spectral_radius.largest_n_across(v, gains, ts)
+def binding(loop: LinearLoop) -> str | None:
+    """Which error bursts blow up first on a straight track at the lap's top speed: along it or across it.
+
+    None if neither ever does, or where no closed form says it.
+    """
+    if loop.closed_form is None:
+        return None
+    along, across = joint_spectral_radius.largest_n_straight(loop)
     if along is None and across is None:
         return None
     if across is None or (along is not None and along <= across):
@@ -241,31 +247,26 @@ def binding(v: float, gains: ControllerParameters, ts: float) -> str | None:
     return ACROSS
 
 
-def _delay(v: float, gains: ControllerParameters, ts: float, edge: Edge, reasons: dict[str, str]) -> float | None:
+def _delay(loop: LinearLoop, reasons: dict[str, str]) -> float | None:
     """Sampled delay margin [s] in closed form; None where no loop is stable or nothing can delay it too long."""
-    steps = min(lifted.critical_delay_along(ts * gains.kx), lifted.critical_delay_across(v, gains, ts))
-    if edge.predicts:
-        reasons["delay_margin"] = "no answer: between samples it is computed for a pose that is held; see n_max.lifted"
-    elif steps <= 0.0:
-        reasons["delay_margin"] = "not met: the error does not contract even without a delay"
+    name = "delay_margin"
+    if loop.predicts:
+        reasons[name] = "no answer: between samples it is computed for a pose that is held; see n_max.lifted"
+        return None
+    if loop.closed_form is None:
+        reasons[name] = "no answer: between samples it is computed for Kanayama's law on a unicycle; see n_max.lifted"
+        return None
+    steps = lifted.critical_delay(loop)
+    if steps <= 0.0:
+        reasons[name] = "not met: the error does not contract even without a delay"
     elif math.isinf(steps):
-        reasons["delay_margin"] = "no bound: no delay is too long"
+        reasons[name] = "no bound: no delay is too long"
     else:
-        return ts * steps
+        return loop.ts * steps
     return None
 
 
-def _lap(scenario: Scenario) -> int:
-    """Steps of one lap; of a track from a file, those of the run."""
-    steps = lap_steps(scenario.error_detector)
-    if scenario.error_detector.track == "csv" and math.isfinite(scenario.plant.duration):
-        steps = round(scenario.plant.duration / scenario.plant.ts)
-    return max(1, steps)
-
-
-def _burst(
-    scenario: Scenario, v_r: Floats, w_r: Floats, edge: Edge, reasons: dict[str, str]
-) -> tuple[float | None, float | None]:
+def _burst(scenario: Scenario, loop: LinearLoop, reasons: dict[str, str]) -> tuple[float | None, float | None]:
     """Loss rate of the scenario's uplink, and the critical mean burst at it."""
     chain = chain_of(scenario.relay.uplink)
     loss_rate = None if chain is None else chain.loss_rate
@@ -276,14 +277,14 @@ def _burst(
     if not 0.0 < loss_rate < 1.0:
         reasons[name] = f"no answer: the scenario's uplink loses {'nothing' if loss_rate == 0.0 else 'everything'}"
         return loss_rate, None
-    found = mean_square.critical_burst(loss_rate, v_r, w_r, scenario.controller, scenario.plant.ts, edge)
+    found = mean_square.critical_burst(loop, loss_rate)
     if math.isinf(found):
         reasons[name] = "no bound: bursts of a million slots on average are not too long"
         return loss_rate, None
     return loss_rate, _none_below_zero(found, name, reasons)
 
 
-def _both_links(scenario: Scenario, v_r: Floats, w_r: Floats, edge: Edge, reasons: dict[str, str]) -> float | None:
+def _both_links(scenario: Scenario, loop: LinearLoop, reasons: dict[str, str]) -> float | None:
     """Growth per step with both links as the scenario has them, None where nothing is lost or nothing can be said."""
     name, policy = "both_links.mean_square_growth", scenario.plant.downlink_policy
     uplink, downlink = chain_of(scenario.relay.uplink), chain_of(scenario.relay.downlink)
@@ -296,10 +297,8 @@ def _both_links(scenario: Scenario, v_r: Floats, w_r: Floats, edge: Edge, reason
     elif scenario.relay.downlink.correlation != 0.0:
         reasons[name] = "no answer: computed for links that lose independently of each other"
     else:
-        growth = mean_square_two_links.lap_growth(
-            v_r, w_r, scenario.controller, scenario.plant.ts, uplink, downlink, edge, policy == "zero"
-        )
-        return growth / len(v_r)
+        links = mean_square_two_links.independent(uplink, downlink)
+        return mean_square_two_links.lap_growth(loop, links, policy == "zero") / loop.steps
     return None
 
 

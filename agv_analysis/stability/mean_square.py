@@ -1,7 +1,7 @@
-"""Mean square: does E[|e|^2] die out under random losses?
+"""Mean square: does E[|z|^2] die out under random losses?
 
-With what the edge takes for the error, h, the loop is a Markov jump linear system: xi = (e, h) goes to ((F+G) e, H e)
-at a reception and to (F e + G h, H h) at a loss, with H = I where the sample is held (see `linearisation`). With
+With what the edge takes for the error, h, the loop (see `linear_loop`) is a Markov jump linear system: xi = (z, h) goes
+to A_1 xi = ((F + G C) z, (H C + K) z) at a reception and to A_0 xi = (F z + G h, K z + H h) at a loss. With
 X_i = E[xi xi'; channel in state i] the second moments obey the linear recursion
 
     X_j(k+1) = sum_i T_ij [ g_i A_1(k) X_i(k) A_1(k)' + (1 - g_i) A_0(k) X_i(k) A_0(k)' ]
@@ -20,169 +20,243 @@ import functools
 import itertools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.run import Floats
-from agv_analysis.stability.linearisation import HELD, MARGINAL, Edge, is_constant, reachable, seen, step_matrices
+from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import multiply
-from agv_cloud.parameters import ControllerParameters
 
 _LAPS = 40
+
+_LARGEST = 400
+"""Size of the recursion's matrix up to which its eigenvalues are asked for instead of driving laps."""
+
+_STEPS = 2000
+"""Steps that a loop is driven at once which is the same at every step."""
 
 MOST_LOST = 0.9999
 """Largest loss probability that is asked for behind a predictor, which may make any of them harmless."""
 
 
-def operator(F: Floats, G: Floats, chain: Chain, H: Floats | None = None) -> Floats:
-    """Matrix of the recursion at one step's F and G, shape (m, m) each: shape (s, s), s = states * (2 m)^2."""
-    size, zero, H = len(F), np.zeros_like(F), np.eye(len(F)) if H is None else H
-    received = np.block([[F + G, zero], [H, zero]])
-    missed = np.block([[F, G], [zero, H]])
+def step_maps(loop: LinearLoop, k: int = 0) -> tuple[Floats, Floats]:
+    """(A_1, A_0) of step k: maps of (z, h) at a reception and at a loss, shape (m + q, m + q) each."""
+    m, q = loop.size, loop.outputs
+    C, row = np.eye(q, m), 0 if loop.is_constant else k
+    F, G = loop.F[row], loop.G[row]
+    H = np.eye(q) if loop.H is None else loop.H[row]
+    K = np.zeros((q, m)) if loop.K is None else loop.K[row]
+    received = np.block([[F + G @ C, np.zeros((m, q))], [H @ C + K, np.zeros((q, q))]])
+    return received, np.block([[F, G], [K, H]])
+
+
+def operator(received: Floats, missed: Floats, chain: Chain) -> Floats:
+    """Matrix of the recursion for the maps of `step_maps`, n = m + q: shape (states * n^2, states * n^2)."""
     rows = [
         np.kron(T_i[:, None], g * np.kron(received, received) + (1.0 - g) * np.kron(missed, missed))
         for T_i, g in zip(chain.transition, chain.delivery, strict=True)
     ]
-    return np.hstack(rows).reshape(len(rows) * 4 * size * size, -1)
+    return np.hstack(rows).reshape(len(rows) * len(missed) ** 2, -1)
 
 
-def spectral_radius(F: Floats, G: Floats, chain: Chain, H: Floats | None = None) -> float:
-    """Growth of the second moments per step at speeds that do not change; arguments as of `operator`."""
-    return float(np.abs(np.linalg.eigvals(operator(F, G, chain, H))).max())
+def spectral_radius(received: Floats, missed: Floats, chain: Chain) -> float:
+    """Growth of the second moments per step of a loop that stays as it is; arguments as of `operator`."""
+    return float(np.abs(np.linalg.eigvals(operator(received, missed, chain))).max())
 
 
 def along_spectral_radius(a: float, chain: Chain) -> float:
     """As `spectral_radius`, of the error along a straight track alone; a = T_s K_x."""
-    return spectral_radius(np.ones((1, 1)), np.full((1, 1), -a), chain)
+    return spectral_radius(np.array([[1.0 - a, 0.0], [1.0, 0.0]]), np.array([[1.0, -a], [0.0, 1.0]]), chain)
 
 
-def lap_growth(
-    v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, chain: Chain, moments: Floats | None = None,
-    edge: Edge = HELD,
-) -> float:  # fmt: skip
-    """Growth (logarithm) of the second moments over a lap with the speeds v_r [m/s], w_r [rad/s] of shape (N,).
+class Moments(NamedTuple):
+    """Second moments by channel state."""
 
-    By driving laps until the growth settles; `moments`, shape (3, states, m, m), are those to begin with, and are left
-    as they settled, which makes the next call with a similar chain faster.
+    zz: Floats
+    """E[z z'], shape (states, m, m)."""
+    zh: Floats
+    """E[z h'], shape (states, m, q)."""
+    hh: Floats
+    """E[h h'], shape (states, q, q)."""
+
+    @classmethod
+    def unit(cls, loop: LinearLoop, states: int) -> Moments:
+        """Moments for `lap_growth` to begin with."""
+        m, q = loop.size, loop.outputs
+        return cls(*(np.array(np.broadcast_to(np.eye(*shape), (states, *shape))) for shape in ((m, m), (m, q), (q, q))))
+
+    def size(self) -> float:
+        """Sum of all mean squares."""
+        return float(sum(np.trace(part, axis1=1, axis2=2).sum() for part in (self.zz, self.hh)))
+
+
+def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None) -> float:
+    """Growth (logarithm) of the second moments over a lap.
+
+    By driving laps until the growth settles; `moments` are those to begin with, and are left as they settled, which
+    makes the next call with a similar chain faster.
     """
-    size = reachable(v_r, w_r)
-    if edge.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
-        chain, moments, edge = bernoulli(0.0), None, HELD
-    F, G = (np.ascontiguousarray(M[:, :size, :size]) for M in step_matrices(v_r, w_r, gains, ts))
-    G, H = seen(F, G, edge)
-    if is_constant(v_r, w_r) and len(chain.delivery) <= 8:
-        return len(v_r) * math.log(spectral_radius(F[0], G[0], chain, None if H is None else H[0]))
-    if H is None:
-        H = F[:0]
+    if loop.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
+        chain, moments = bernoulli(0.0), None
+    if loop.is_constant and len(chain.delivery) * (loop.size + loop.outputs) ** 2 <= _LARGEST:
+        return loop.steps * math.log(spectral_radius(*step_maps(loop), chain))
     if moments is None:
-        moments = unit_moments(len(chain.delivery))
-    moments = moments[:, :, :size, :size]
-    growth = settled_growth(
-        moments,
-        lambda: float(compiled(_drive_lap)(F, G, H, chain.transition, chain.delivery, moments)),
-        lambda: float(np.trace(moments[0] + moments[2], axis1=1, axis2=2).sum()),
+        moments = Moments.unit(loop, len(chain.delivery))
+    return settled_growth(loop, moments, moments.size, _drive(loop, chain, moments))
+
+
+def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:
+    """Sends the moments through so many steps, in place; they are to be multiplied by exp(what it returns)."""
+    q = loop.outputs
+    H = np.empty((0, q, q)) if loop.H is None else loop.H
+    K = np.empty((0, q, loop.size)) if loop.K is None else loop.K
+    return lambda steps: float(
+        compiled(_drive_lap)(loop.F, loop.G, H, K, chain.transition, chain.delivery, steps, *moments)
     )
-    if growth == -math.inf:  # a predictor leaves nothing of the error but rounding
-        moments[:] = np.eye(size)
-    return growth
 
 
-def settled_growth(moments: Floats, drive_lap: Callable[[], float], size: Callable[[], float]) -> float:
+def settled_growth(
+    loop: LinearLoop, moments: tuple[Floats, ...], size: Callable[[], float], drive: Callable[[int], float]
+) -> float:
     """Growth (logarithm) of second moments over a lap, by driving laps until it settles; -inf if nothing is left.
 
-    `drive_lap` sends them through a lap in place, to be multiplied by exp(what it returns); `size` is theirs.
+    `drive` sends them through so many steps in place, to be multiplied by exp(what it returns); `size` is theirs.
     """
-    growth = math.nan
+    steps, growth = _STEPS if loop.is_constant else loop.steps, math.nan
     for _ in range(_LAPS):
-        log_scale, size_now = drive_lap(), size()
+        log_scale, size_now = drive(steps), size()
         if not size_now > 0.0:
+            for part in moments:  # a predictor leaves nothing of the error but rounding
+                part[:] = np.eye(*part.shape[1:])
             return -math.inf
         # From one lap to the next the moments keep their proportions in the end, so their size says it all.
-        moments /= size_now
+        for part in moments:
+            part /= size_now
         before, growth = growth, log_scale + math.log(size_now)
         if abs(growth - before) <= 1e-8 * max(1.0, abs(growth)):
             break
-    return growth
+    return growth * (loop.steps / steps)
 
 
-def unit_moments(states: int) -> Floats:
-    """Moments for `lap_growth` to begin with."""
-    return np.array(np.broadcast_to(np.eye(3), (3, states, 3, 3)))
+def _drive_lap(
+    F: Floats, G: Floats, H: Floats, K: Floats, T: Floats, g: Floats, steps: int, zz: Floats, zh: Floats, hh: Floats
+) -> float:
+    """Send `Moments` through so many steps; in place, to be multiplied by exp(return value).
 
-
-def _drive_lap(F: Floats, G: Floats, H: Floats, T: Floats, g: Floats, moments: Floats) -> float:
-    """Send the moments E[e e'], E[e h'], E[h h'] by channel state, shape (3, states, m, m), through a lap; in place.
-
-    H has no row where it is the identity. What is left in them is to be multiplied by exp(return value).
+    H has no row where it is the identity, K none where it is zero.
     """
-    states, size = moments.shape[1], moments.shape[2]
+    states, m, q = zh.shape
     log_scale = 0.0
-    # Of each state: what goes on if its slot is received, and if it is lost; each as (ee, eh, hh).
-    received, missed = np.zeros_like(moments), np.zeros_like(moments)
-    upper, M = np.zeros((size, size)), np.zeros((size, size))
-    for k in range(F.shape[0]):
-        M[:] = F[k] + G[k]
+    # Of each state: what goes on if its slot is received, and if it is lost.
+    received_zz, received_zh, received_hh = np.zeros_like(zz), np.zeros_like(zh), np.zeros_like(hh)
+    missed_zz, missed_zh, missed_hh = np.zeros_like(zz), np.zeros_like(zh), np.zeros_like(hh)
+    of_z, of_h, M = np.zeros((m, m)), np.zeros((m, q)), np.zeros((m, m))
+    h_of_z, h_of_h, N = np.zeros((q, m)), np.zeros((q, q)), np.zeros((q, m))
+    for k in range(steps):
+        row = k % F.shape[0]
+        for i in range(m):
+            for j in range(m):
+                M[i, j] = F[row, i, j] + G[row, i, j] if j < q else F[row, i, j]
+        if len(H):
+            N[:, :q] = H[row]
+            if len(K):
+                N[:, q:] = 0.0
+                N += K[row]
         for i in range(states):
-            ee, eh, hh = moments[0, i], moments[1, i], moments[2, i]
-            multiply(M, ee, False, received[1, i], False)
-            multiply(received[1, i], M, True, received[0, i], False)
-            received[2, i] = ee
-            multiply(F[k], eh, False, missed[1, i], False)
-            multiply(G[k], hh, False, missed[1, i], True)
-            multiply(F[k], ee, False, upper, False)
-            multiply(G[k], eh, True, upper, True)
-            multiply(upper, F[k], True, missed[0, i], False)
-            multiply(missed[1, i], G[k], True, missed[0, i], True)
-            missed[2, i] = hh
+            multiply(M, zz[i], False, of_z, False)
+            _symmetric_product(of_z, M, received_zz[i], False)
             if len(H):
-                for which in (received, missed):
-                    multiply(which[1, i], H[k], True, upper, False)
-                    which[1, i] = upper
-                    multiply(which[2, i], H[k], True, upper, False)
-                    multiply(H[k], upper, False, which[2, i], False)
+                multiply(of_z, N, True, received_zh[i], False)
+                multiply(N, zz[i], False, h_of_z, False)
+                _symmetric_product(h_of_z, N, received_hh[i], False)
+            else:
+                _copy(of_z, received_zh[i])
+                _copy(zz[i], received_hh[i])
+            multiply(F[row], zh[i], False, of_h, False)
+            multiply(G[row], hh[i], False, of_h, True)
+            multiply(F[row], zz[i], False, of_z, False)
+            multiply(G[row], zh[i], True, of_z, True)
+            _symmetric_product(of_z, F[row], missed_zz[i], False)
+            _symmetric_product(of_h, G[row], missed_zz[i], True)
+            if len(H):
+                multiply(of_h, H[row], True, missed_zh[i], False)
+                multiply(H[row], hh[i], False, h_of_h, False)
+                if len(K):
+                    multiply(of_z, K[row], True, missed_zh[i], True)
+                    multiply(K[row], zh[i], False, h_of_h, True)
+                    multiply(K[row], zz[i], False, h_of_z, False)
+                    multiply(H[row], zh[i], True, h_of_z, True)
+                _symmetric_product(h_of_h, H[row], missed_hh[i], False)
+                if len(K):
+                    _symmetric_product(h_of_z, K[row], missed_hh[i], True)
+            else:
+                _copy(of_h, missed_zh[i])
+                _copy(hh[i], missed_hh[i])
         largest = 0.0
         for j in range(states):
-            _mix(T[:, j], g, received, missed, moments[:, j])
-            for p in range(size):
-                largest = max(largest, moments[0, j, p, p], moments[2, j, p, p])
-                for q in range(p):
-                    # Rounding makes a skew part, which would not obey the recursion of the moments and outlive them.
-                    mean = 0.5 * (moments[0, j, p, q] + moments[0, j, q, p])
-                    moments[0, j, p, q], moments[0, j, q, p] = mean, mean
+            _mix(T[:, j], g, received_zz, missed_zz, zz[j])
+            _mix(T[:, j], g, received_zh, missed_zh, zh[j])
+            _mix(T[:, j], g, received_hh, missed_hh, hh[j])
+            for p in range(m):
+                largest = max(largest, zz[j, p, p])
+            for p in range(q):
+                largest = max(largest, hh[j, p, p])
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            moments /= largest
+            zz /= largest
+            zh /= largest
+            hh /= largest
             log_scale += math.log(largest)
     return log_scale
 
 
 def _mix(weights: Floats, g: Floats, received: Floats, missed: Floats, mixed: Floats) -> None:
     """What comes into one state: from each state i with weight T_ij, received with probability g_i or lost."""
-    for which in range(3):
-        for p in range(mixed.shape[1]):
-            for q in range(mixed.shape[1]):
-                value = 0.0
-                for i in range(len(g)):
-                    came = g[i] * received[which, i, p, q] + (1.0 - g[i]) * missed[which, i, p, q]
-                    value += weights[i] * came
-                mixed[which, p, q] = value
+    for p in range(mixed.shape[0]):
+        for r in range(mixed.shape[1]):
+            value = 0.0
+            for i in range(len(g)):
+                value += weights[i] * (g[i] * received[i, p, r] + (1.0 - g[i]) * missed[i, p, r])
+            mixed[p, r] = value
 
 
-def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD) -> float:
+def _copy(source: Floats, copy: Floats) -> None:
+    """`copy` = the first rows and columns of `source`."""
+    for i in range(copy.shape[0]):
+        for j in range(copy.shape[1]):
+            copy[i, j] = source[i, j]
+
+
+def _symmetric_product(A: Floats, B: Floats, product: Floats, add: bool) -> None:
+    """`product` = A B', added to what is there if `add`, of which only one half is computed: the whole is symmetric.
+
+    Rounding must not make a skew part, which would not obey the recursion of the moments and outlive them.
+    """
+    for i in range(product.shape[0]):
+        for j in range(i + 1):
+            value = product[i, j] if add else 0.0
+            for m in range(A.shape[1]):
+                value += A[i, m] * B[j, m]
+            product[i, j] = value
+            product[j, i] = value
+
+
+def critical_loss(loop: LinearLoop) -> float:
     """Loss probability p* below which independent losses leave a lap mean-square stable; -1: unstable without any.
 
     Behind a predictor 1 if they do at every p up to MOST_LOST.
     """
-    moments = unit_moments(1)
+    moments = Moments.unit(loop, 1)
 
     @functools.cache  # the ends of an interval are asked for again
     def growth(p: float) -> float:
-        return lap_growth(v_r, w_r, gains, ts, bernoulli(p), moments, edge) - MARGINAL * len(v_r)
+        return lap_growth(loop, bernoulli(p), moments) - MARGINAL * loop.steps
 
     if growth(0.0) >= 0.0:
         return -1.0
-    if not edge.predicts:
+    if not loop.predicts:
         return crossing(growth, 0.0, 1.0)
     tried = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, MOST_LOST)
     for low, high in itertools.pairwise(tried):
@@ -191,18 +265,16 @@ def critical_loss(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: flo
     return 1.0
 
 
-def critical_burst(
-    loss_rate: float, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float, edge: Edge = HELD
-) -> float:
+def critical_burst(loop: LinearLoop, loss_rate: float) -> float:
     """Mean burst B* [steps] below which a Gilbert channel of this loss rate in (0, 1) leaves a lap mean-square stable.
 
     -1 if the shortest bursts possible are too long, inf if 1e6 steps are not.
     """
-    moments = unit_moments(2)
+    moments = Moments.unit(loop, 2)
 
     @functools.cache
     def growth(burst: float) -> float:
-        return lap_growth(v_r, w_r, gains, ts, bursty(loss_rate, burst), moments, edge) - MARGINAL * len(v_r)
+        return lap_growth(loop, bursty(loss_rate, burst), moments) - MARGINAL * loop.steps
 
     low, high = 0.0, shortest_mean_burst(loss_rate)
     while growth(high) < 0.0:

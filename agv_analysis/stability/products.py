@@ -39,14 +39,15 @@ def log_spectral_radius(factors: Floats) -> float:
     return log_scale + float(np.log(radius)) if radius > 0.0 else -np.inf
 
 
-def growths(factors: Floats) -> Floats:
-    """Logarithms of the moduli of all eigenvalues of a product, largest first, shape (m,); `factors` as above.
+def growths(factors: Floats, count: int | None = None) -> Floats:
+    """Logarithms of the moduli of the `count` largest eigenvalues of a product, largest first, all m by default.
 
     Also of those that the product itself would lose to rounding: the matrix of all minors of order i (i-th compound) of
     a product is the product of those of its factors, and its largest eigenvalue is the product of the i largest (Horn
-    and Johnson, Matrix Analysis, 2nd ed., 0.8.1). -inf for what is annihilated.
+    and Johnson, Matrix Analysis, 2nd ed., 0.8.1). -inf for what is annihilated. `factors` as of `ordered_product`.
     """
-    of_largest = [log_spectral_radius(_minors(factors, order)) for order in range(1, factors.shape[-1] + 1)]
+    orders = range(1, (count or factors.shape[-1]) + 1)
+    of_largest = [log_spectral_radius(_minors(factors, order) if order > 1 else factors) for order in orders]
     with np.errstate(invalid="ignore"):
         found = np.diff(of_largest, prepend=0.0)
     return np.where(np.isnan(found), -np.inf, found)
@@ -90,14 +91,13 @@ def _orthogonalised_pass(factors: Floats, basis: Floats, logs: Floats) -> None:
 
 
 def multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool) -> None:
-    """`product` = A B, or A B' if `transposed`; added to what is there if `add`. All of shape (m, m).
+    """`product` = A B, or A B' if `transposed`; added to what is there if `add`. Shapes (p, s), (s, r) and (p, r).
 
     Written to be compiled into its callers, where numpy's own costs more than the product.
     """
-    size = A.shape[0]
-    for i in range(size):
-        for j in range(size):
+    for i in range(product.shape[0]):
+        for j in range(product.shape[1]):
             value = product[i, j] if add else 0.0
-            for m in range(size):
+            for m in range(A.shape[1]):
                 value += A[i, m] * (B[j, m] if transposed else B[m, j])
             product[i, j] = value

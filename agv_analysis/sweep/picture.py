@@ -142,9 +142,11 @@ def margins(base: Scenario, axes: Sequence[Axis], points: Sequence[tuple[Any, ..
 
 def _margins(scenario: Scenario) -> tuple[float, float]:
     from agv_analysis.stability.almost_sure import exponent_along
+    from agv_analysis.stability.scenario_loop import straight_loop_of
 
-    chain, a = _renewals(scenario), scenario.plant.ts * scenario.controller.kx * scenario.plant.speed_scale
-    if chain is None or scenario.error_detector.policy == "predict":
+    chain, loop = _renewals(scenario), straight_loop_of(scenario)
+    a = loop.along_gain
+    if chain is None or a is None or loop.predicts:
         return math.nan, math.nan
     return a * (chain.mean_age + 0.5) - 1.0, exponent_along(a, chain)
 

@@ -22,7 +22,7 @@ from agv_analysis.stability.almost_sure import (
     is_degenerate,
     sample_losses,
 )
-from agv_analysis.stability.linearisation import step_matrices
+from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_cloud.parameters import ControllerParameters
 
 CONFIG = str(Path(__file__).parents[3] / "config/paper.yaml")
@@ -30,8 +30,8 @@ TS = 0.005
 Floats = NDArray[np.float64]
 
 
-def constant(v: float, w: float = 0.0) -> tuple[Floats, Floats]:
-    return np.array([v]), np.array([w])
+def constant(v: float, w: float, by: ControllerParameters) -> LinearLoop:
+    return kanayama_loop(np.array([v]), np.array([w]), by, TS)
 
 
 # -- along the track -------------------------------------------------------------------------------------------------
@@ -97,8 +97,8 @@ def test_the_critical_loss_along_is_the_first_zero(a: float) -> None:
 
 def test_gains_that_do_not_contract_even_without_losses() -> None:
     assert (critical_loss_along(0.0), critical_loss_along(2.0), critical_loss_along(2.5)) == (-1.0, -1.0, -1.0)
-    assert critical_loss(*constant(1.0), ControllerParameters(kx=401.0), TS) == -1.0
-    assert critical_loss(*constant(1.0), ControllerParameters(kx=0.0), TS) == -1.0
+    assert critical_loss(constant(1.0, 0.0, ControllerParameters(kx=401.0))) == -1.0
+    assert critical_loss(constant(1.0, 0.0, ControllerParameters(kx=0.0))) == -1.0
 
 
 # -- all three errors ------------------------------------------------------------------------------------------------
@@ -106,7 +106,8 @@ def test_gains_that_do_not_contract_even_without_losses() -> None:
 
 def by_qr(v: float, w: float, by: ControllerParameters, p: float, steps: int, seed: int) -> Floats:
     """Exponents from numpy's QR after every reception, losses from a generator of this test's own."""
-    F, G = (M[0] for M in step_matrices(*constant(v, w), by, TS))
+    loop = constant(v, w, by)
+    F, G = loop.F[0], loop.G[0]
     random = np.random.default_rng(seed)
     basis, error, logs = np.eye(3), np.eye(3), np.zeros(3)
     for lost in (random.random(steps) < p).tolist():
@@ -122,15 +123,16 @@ def by_qr(v: float, w: float, by: ControllerParameters, p: float, steps: int, se
     ("v", "w", "kx", "p"), [(8.0, 0.0, 30.0, 0.5), (8.0, 3.0, 70.0, 0.6), (20.0, -1.0, 130.0, 0.4)]
 )
 def test_exponents_by_qr(v: float, w: float, kx: float, p: float) -> None:
-    found = exponents(*constant(v, w), ControllerParameters(kx=kx, ky=2.0, ktheta=3.0), TS, bernoulli(p), steps=200_000)
-    truth = by_qr(v, w, ControllerParameters(kx=kx, ky=2.0, ktheta=3.0), p, 40_000, 3)
+    by = ControllerParameters(kx=kx, ky=2.0, ktheta=3.0)
+    found = exponents(constant(v, w, by), bernoulli(p), steps=200_000)
+    truth = by_qr(v, w, by, p, 40_000, 3)
     # The truth is five times shorter, so its own error is some sqrt(5) times as large.
     np.testing.assert_array_less(np.abs(found.values - truth), 5.0 * math.sqrt(6.0) * found.errors + 2e-4)
     assert found.errors.max() < 0.05
 
 
 def test_on_a_line_the_exponents_hold_the_one_along() -> None:
-    found = exponents(*constant(8.0), ControllerParameters(kx=70.0, ky=2.0, ktheta=3.0), TS, bursty(0.4, 2.5))
+    found = exponents(constant(8.0, 0.0, ControllerParameters(kx=70.0, ky=2.0, ktheta=3.0)), bursty(0.4, 2.5))
     truth = exponent_along(0.35, bursty(0.4, 2.5))
     nearest = int(np.abs(found.values - truth).argmin())
     assert abs(found.values[nearest] - truth) < 5.0 * found.errors[nearest]
@@ -138,19 +140,19 @@ def test_on_a_line_the_exponents_hold_the_one_along() -> None:
 
 @pytest.mark.parametrize("n", [0, 4])
 def test_periodic_losses_are_no_game_of_chance(n: int) -> None:
-    by = ControllerParameters(kx=70.0, ky=2.0, ktheta=3.0)
-    F, G = (M[0] for M in step_matrices(*constant(8.0, 3.0), by, TS))
+    loop = constant(8.0, 3.0, ControllerParameters(kx=70.0, ky=2.0, ktheta=3.0))
+    F, G = loop.F[0], loop.G[0]
     M = np.eye(3)
     for _ in range(n + 1):
         M = F @ M + G
     truth = np.sort(np.log(np.abs(np.linalg.eigvals(M))) / (n + 1))[::-1]
     chain = Chain(np.roll(np.eye(n + 1), 1, axis=1), np.eye(n + 1)[0])
-    found = exponents(*constant(8.0, 3.0), by, TS, chain, steps=50_000)
+    found = exponents(loop, chain, steps=50_000)
     np.testing.assert_allclose(found.values, truth, atol=1e-4)
 
 
 def test_nothing_received() -> None:
-    found = exponents(*constant(1.0), ControllerParameters(), TS, bernoulli(1.0), steps=1000)
+    found = exponents(constant(1.0, 0.0, ControllerParameters()), bernoulli(1.0), steps=1000)
     assert found.values.tolist() == [0.0, 0.0, 0.0]
     assert np.isinf(found.errors).all()
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from agv_analysis.stability.linear_loop import LinearLoop
 from scipy.optimize import fsolve
 
 from agv_analysis.run import Floats
@@ -17,6 +16,7 @@ from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability.derived_loop import derived_loop, linear_loop
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
+from agv_analysis.stability.linear_loop import LinearLoop
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
 TS = 0.005

@@ -17,6 +17,7 @@ from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.floquet import constant_delay, drop_sequence, largest_constant_delay, trajectory
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.products import growths, log_spectral_radius, ordered_product
 from agv_cloud.parameters import ControllerParameters
@@ -35,13 +36,9 @@ Floats = NDArray[np.float64]
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
 @pytest.mark.parametrize(("kx", "last"), [(5.0, 62), (25.0, 12), (250.0, 0)])
 def test_the_canonical_scenario_whatever_the_track(lap: Lap, track: str, kx: float, last: int) -> None:
-    v, w = lap(track)[1:]
-    assert largest_constant_delay(v, w, ControllerParameters(kx=kx), TS) == last
-    assert (
-        constant_delay(last, v, w, ControllerParameters(kx=kx), TS)
-        < 0.0
-        < constant_delay(last + 1, v, w, ControllerParameters(kx=kx), TS)
-    )
+    loop = kanayama_loop(*lap(track)[1:], ControllerParameters(kx=kx), TS)
+    assert largest_constant_delay(loop) == last
+    assert constant_delay(loop, last) < 0.0 < constant_delay(loop, last + 1)
 
 
 @pytest.mark.parametrize("n", [0, 1, 3, 7])
@@ -57,14 +54,14 @@ def test_a_short_lap_by_the_product_of_its_companions(lap: Lap, track: str, n: i
         lifted[:3, -3:] += G[k]
         product = lifted @ product
     truth = math.log(np.abs(np.linalg.eigvals(product)).max())
-    assert constant_delay(n, v, w, by, TS) == pytest.approx(truth, abs=1e-6)
+    assert constant_delay(kanayama_loop(v, w, by, TS), n) == pytest.approx(truth, abs=1e-6)
 
 
 def test_nothing_stable_and_everything_stable(lap: Lap) -> None:
     v, w = lap("paper", 400)[1:]
-    assert largest_constant_delay(v, w, ControllerParameters(kx=401.0), TS) == -1
-    assert largest_constant_delay(v, w, ControllerParameters(kx=1.0), TS, limit=20) is None
-    assert largest_constant_delay(0.0 * v, w, ControllerParameters(kx=0.0), TS) == -1
+    assert largest_constant_delay(kanayama_loop(v, w, ControllerParameters(kx=401.0), TS)) == -1
+    assert largest_constant_delay(kanayama_loop(v, w, ControllerParameters(kx=1.0), TS), limit=20) is None
+    assert largest_constant_delay(kanayama_loop(0.0 * v, w, ControllerParameters(kx=0.0), TS)) == -1
 
 
 # -- a given sequence of losses --------------------------------------------------------------------------------------
@@ -88,7 +85,7 @@ def test_random_sequences_by_step(lap: Lap, seed: int, p: float, track: str) -> 
     v, w = lap(track, 80)[1:]
     lost = np.random.default_rng(seed).random(80) < p
     by = ControllerParameters(kx=35.0, ky=2.0, ktheta=3.0)
-    found, truth = drop_sequence(lost, 10.0 * v, w, by, TS), by_step(lost, 10.0 * v, w, by)
+    found, truth = drop_sequence(kanayama_loop(10.0 * v, w, by, TS), lost), by_step(lost, 10.0 * v, w, by)
     if lost.all():
         assert found.tolist() == [0.0, 0.0, 0.0]
     else:
@@ -102,17 +99,18 @@ def test_on_a_line_a_sequence_is_a_product_of_numbers() -> None:
     lost = np.concatenate([[False] + [True] * (length - 1) for length in lengths])
     v, w = np.ones(len(lost)), np.zeros(len(lost))
     truth = sum(math.log(abs(1.0 - 0.125 * length)) for length in lengths)
-    assert np.abs(drop_sequence(lost, v, w, ControllerParameters(), TS) - truth).min() < 1e-9
-    assert drop_sequence(lost, 0.0 * v, w, ControllerParameters(), TS) == pytest.approx([truth], abs=1e-9)
-    deadbeat = drop_sequence(
-        np.zeros(50, dtype=np.bool_), np.zeros(50), np.zeros(50), ControllerParameters(kx=200.0), TS
-    )
+    assert np.abs(drop_sequence(kanayama_loop(v, w, ControllerParameters(), TS), lost) - truth).min() < 1e-9
+    parked = kanayama_loop(0.0 * v, w, ControllerParameters(), TS)
+    assert drop_sequence(parked, lost) == pytest.approx([truth], abs=1e-9)
+    parked = kanayama_loop(np.zeros(50), np.zeros(50), ControllerParameters(kx=200.0), TS)
+    deadbeat = drop_sequence(parked, np.zeros(50, dtype=np.bool_))
     assert deadbeat.tolist() == [-math.inf]
 
 
 def test_nothing_received_is_an_open_loop() -> None:
     lost = np.ones(20, dtype=np.bool_)
-    assert drop_sequence(lost, np.ones(20), np.zeros(20), ControllerParameters(), TS).tolist() == [0.0, 0.0, 0.0]
+    loop = kanayama_loop(np.ones(20), np.zeros(20), ControllerParameters(), TS)
+    assert drop_sequence(loop, lost).tolist() == [0.0, 0.0, 0.0]
 
 
 # -- the motion that was driven --------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from agv_analysis.stability.joint_spectral_radius import (
     largest_n_along,
     verdict,
 )
+from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
 from agv_cloud.parameters import ControllerParameters
 
@@ -37,8 +38,8 @@ TS = 0.005
 Floats = NDArray[np.float64]
 
 
-def constant(v: float, w: float) -> tuple[Floats, Floats]:
-    return np.full(5, v), np.full(5, w)
+def constant(v: float, w: float, by: ControllerParameters) -> LinearLoop:
+    return kanayama_loop(np.full(5, v), np.full(5, w), by, TS)
 
 
 def burst_map(F: Floats, G: Floats, first: int, length: int) -> Floats:
@@ -55,7 +56,7 @@ def burst_map(F: Floats, G: Floats, first: int, length: int) -> Floats:
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
 @pytest.mark.parametrize(("kx", "last"), [(5.0, 78), (25.0, 14), (250.0, 0)])
 def test_the_canonical_scenario_whatever_the_track(lap: Lap, track: str, kx: float, last: int) -> None:
-    assert largest_n(*lap(track)[1:], ControllerParameters(kx=kx), TS) == (last, last + 1)
+    assert largest_n(kanayama_loop(*lap(track)[1:], ControllerParameters(kx=kx), TS)) == (last, last + 1)
 
 
 def separation(track: str, kx: float, n: int, steps: int) -> float:
@@ -150,14 +151,13 @@ CASES = [(1.0, 0.0, 25.0, 1.0, 2.0, 12), (1.5, 0.6, 60.0, 4.0, 3.0, 4), (8.0, -2
 def test_the_certificate_is_a_norm_that_every_burst_shrinks(
     v: float, w: float, kx: float, ky: float, ktheta: float, n: int
 ) -> None:
-    by, (v_r, w_r) = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), constant(v, w)
-    found = verdict(n, v_r, w_r, by, TS)
+    loop = constant(v, w, ControllerParameters(kx=kx, ky=ky, ktheta=ktheta))
+    found, F, G = verdict(loop, n), loop.F, loop.G
     assert found.verdict == STABLE
     P = found.certificate
     assert P is not None
     np.testing.assert_array_equal(P, P.T)
     assert np.linalg.eigvalsh(P)[0] > 0.0
-    F, G = step_matrices(v_r, w_r, by, TS)
     growth = []
     for length in range(1, n + 2):
         M = burst_map(F, G, 0, length)
@@ -170,8 +170,8 @@ def test_the_certificate_is_a_norm_that_every_burst_shrinks(
 @pytest.mark.parametrize(("v", "w", "kx", "ky", "ktheta", "n"), CASES)
 def test_no_sequence_leaves_the_bounds(v: float, w: float, kx: float, ky: float, ktheta: float, n: int) -> None:
     """All products of up to four bursts of five lengths: their radius per step is below the upper bound."""
-    by, (v_r, w_r) = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), constant(v, w)
-    found, (F, G) = verdict(n, v_r, w_r, by, TS), step_matrices(v_r, w_r, by, TS)
+    loop = constant(v, w, ControllerParameters(kx=kx, ky=ky, ktheta=ktheta))
+    found, F, G = verdict(loop, n), loop.F, loop.G
     lengths = sorted({1, 2, (n + 1) // 2, n, n + 1})
     maps = {length: burst_map(F, G, 0, length) for length in lengths}
     radii = {}
@@ -193,7 +193,7 @@ def test_speeds_that_change_inside_a_burst(lap: Lap) -> None:
     v_r, w_r = lap("warehouse", 60)[1:]
     v_r = 10.0 * v_r
     by, n = ControllerParameters(kx=20.0, ky=1.0, ktheta=2.0), 8
-    found, (F, G) = verdict(n, v_r, w_r, by, TS), step_matrices(v_r, w_r, by, TS)
+    found, (F, G) = verdict(kanayama_loop(v_r, w_r, by, TS), n), step_matrices(v_r, w_r, by, TS)
     assert found.verdict in (STABLE, UNDECIDED)
     random = np.random.default_rng(1)
     for _ in range(40):
@@ -222,35 +222,35 @@ def test_the_lower_bound_drives_laps_whose_last_burst_is_cut_short(n: int) -> No
         for first in range(0, 7, length):
             lap_map = burst_map(F, G, first, min(length, 7 - first)) @ lap_map
         radii.append(float(np.abs(np.linalg.eigvals(lap_map)).max()) ** (1.0 / 7.0))
-    found = verdict(n, v_r, w_r, by, TS)
+    found = verdict(kanayama_loop(v_r, w_r, by, TS), n)
     assert found.lower == pytest.approx(max(radii), rel=1e-9)
     assert found.worst == int(np.argmax(radii))
 
 
 @pytest.mark.parametrize("n", [16, 20])
 def test_an_unstable_verdict_names_a_burst_that_grows(n: int) -> None:
-    found = verdict(n, *constant(1.0, 0.0), ControllerParameters(), TS)
+    found = verdict(constant(1.0, 0.0, ControllerParameters()), n)
     assert (found.verdict, found.worst, found.certificate) == (UNSTABLE, n, None)
     assert found.lower == pytest.approx(abs(1.0 - 0.125 * (n + 1)) ** (1.0 / (n + 1)), rel=1e-12)
 
 
 def test_a_parked_agv_is_judged_by_what_it_can_reach() -> None:
-    stopped = np.zeros(10)
-    assert largest_n(stopped, stopped, ControllerParameters(), TS) == (14, 15)
-    assert verdict(14, stopped, stopped, ControllerParameters(), TS).certificate is not None
+    stopped = constant(0.0, 0.0, ControllerParameters())
+    assert largest_n(stopped) == (14, 15)
+    assert verdict(stopped, 14).certificate is not None
 
 
 def test_bursts_that_bring_the_error_to_nothing() -> None:
     """1 / a is an integer: for a parked AGV M_8 = 0 at a = 1/8, and M_1 = 0 at a = 1."""
-    stopped = np.zeros(10)
-    assert verdict(7, stopped, stopped, ControllerParameters(), TS).verdict == STABLE
-    found = verdict(0, stopped, stopped, ControllerParameters(kx=200.0), TS)
+    assert verdict(constant(0.0, 0.0, ControllerParameters()), 7).verdict == STABLE
+    found = verdict(constant(0.0, 0.0, ControllerParameters(kx=200.0)), 0)
     assert (found.verdict, found.lower, found.upper) == (STABLE, 0.0, 0.0)
 
 
 def test_degenerate_gains(lap: Lap) -> None:
-    assert (
-        largest_n(*lap("line")[1:], ControllerParameters(kx=0.0), TS)[0] == -1
-    )  # what is off along the track stays off
-    assert largest_n(*lap("line")[1:], ControllerParameters(kx=200.0), TS) == (0, 1)  # deadbeat
-    assert largest_n(*lap("line")[1:], ControllerParameters(kx=401.0), TS) == (-1, 0)
+    def found(kx: float) -> tuple[int | None, int | None]:
+        return largest_n(kanayama_loop(*lap("line")[1:], ControllerParameters(kx=kx), TS))
+
+    assert found(0.0)[0] == -1  # what is off along the track stays off
+    assert found(200.0) == (0, 1)  # deadbeat
+    assert found(401.0) == (-1, 0)

@@ -10,14 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.stability.linearisation import (
-    burst_maps,
-    is_constant,
-    loop_jacobians,
-    reachable,
-    reception_maps,
-    step_matrices,
-)
+from agv_analysis.stability.linearisation import loop_jacobians, step_matrices
 from agv_analysis.stability.paper import matrices
 from agv_cloud.control.command import limit_speed
 from agv_cloud.control.kanayama import kanayama
@@ -110,67 +103,3 @@ def test_a_of_the_paper_is_their_sum_at_zero_error() -> None:
     np.testing.assert_allclose(
         now + outdated, matrices(pose[:, 2], held[:, 2], speeds[:, 0], ControllerParameters(), TS), atol=1e-14
     )
-
-
-# -- from one reception to the next ----------------------------------------------------------------------------------
-
-
-def driven(F: Floats, G: Floats, first: int, length: int) -> Floats:
-    error = np.eye(3)
-    for k in range(first, first + length):
-        error = F[k % len(F)] @ error + G[k % len(F)]
-    return error
-
-
-def a_lap(steps: int) -> tuple[Floats, Floats]:
-    random = np.random.default_rng(4)
-    return step_matrices(
-        random.uniform(0.0, 20.0, steps),
-        random.uniform(-9.0, 9.0, steps),
-        ControllerParameters(kx=80.0, ky=4.0, ktheta=3.0),
-        TS,
-    )
-
-
-def test_maps_of_bursts_that_run_over_the_end_of_the_lap() -> None:
-    F, G = a_lap(7)
-    for length, M in enumerate(burst_maps(F, G, 16), start=1):
-        np.testing.assert_allclose(M, [driven(F, G, k, length) for k in range(7)], atol=1e-12)
-
-
-def test_at_constant_speeds_they_are_a_power_and_a_sum() -> None:
-    """M_L = F^L + sum of F^i G over i < L; along a line 1 - a L."""
-    F, G = step_matrices(np.ones(1), np.zeros(1), ControllerParameters(), TS)
-    for length, M in enumerate(burst_maps(F, G, 30), start=1):
-        truth = np.linalg.matrix_power(F[0], length)
-        truth = truth + sum(np.linalg.matrix_power(F[0], i) @ G[0] for i in range(length))
-        np.testing.assert_allclose(M[0], truth, atol=1e-12)
-        assert M[0, 0, 0] == pytest.approx(1.0 - 0.125 * length, abs=1e-12)
-
-
-@settings(deadline=None, derandomize=True, max_examples=40)
-@given(st.sets(st.integers(0, 24), min_size=1), st.integers(0, 12))
-def test_maps_between_given_receptions(steps: set[int], beyond: int) -> None:
-    F, G = a_lap(25)
-    received = np.array(sorted(steps), dtype=np.int64)
-    end = int(received[-1]) + 1 + beyond
-    ends = [*received[1:].tolist(), end]
-    truth = [driven(F, G, begin, stop - begin) for begin, stop in zip(received.tolist(), ends, strict=True)]
-    np.testing.assert_allclose(reception_maps(F, G, received, end), truth, atol=1e-10)
-
-
-# -- what the commands can reach -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("v", "w"), [(1.0, 0.0), (0.0, 0.3), (0.0, 0.0), (-1.0, 0.2)])
-def test_reach_is_the_rank_of_what_commands_do(v: float, w: float) -> None:
-    """Rank of (B, F B, F^2 B), where B holds the columns by which v and w - w_r move the error where gains act."""
-    F, G = (M[0] for M in step_matrices(np.array([v]), np.array([w]), ControllerParameters(), TS))
-    rank = np.linalg.matrix_rank(np.hstack((G, F @ G, F @ F @ G)), tol=1e-12)
-    assert reachable(np.array([v]), np.array([w])) == rank
-
-
-def test_constant_speeds() -> None:
-    assert is_constant(np.ones(4), np.full(4, 0.2))
-    assert not is_constant(np.array([1.0, 1.0 + 1e-15]), np.zeros(2))
-    assert not is_constant(np.ones(2), np.array([0.0, 1e-12]))

@@ -20,7 +20,9 @@ from agv_analysis.stability.gains import (
     best_in_mean_square,
     best_kx,
 )
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.margin_map import Point, largest_delays, largest_repeated_burst, margin_map
+from agv_cloud.parameters import ControllerParameters
 from agv_ros.errors import UserError
 
 REPOSITORY = Path(__file__).parents[3]
@@ -195,8 +197,9 @@ def test_the_exponent_itself_has_no_best_gain() -> None:
 
 
 def test_best_gains_in_their_units() -> None:
-    found = best_kx(gilbert_elliott(0.02, 0.2), 0.005)
+    loop = kanayama_loop(np.ones(1), np.zeros(1), ControllerParameters(), 0.005)
+    found = best_kx(loop, gilbert_elliott(0.02, 0.2))
     assert found["no_outages"] == pytest.approx(200.0)
     assert found["delay"] == pytest.approx(200.0 * 5**5 / 6**6)
     assert found["mean_square"] < found["bursts"] < found["no_outages"]
-    assert best_kx(bernoulli(0.0), 0.005)["mean_square"] == pytest.approx(200.0, rel=1e-4)
+    assert best_kx(loop, bernoulli(0.0))["mean_square"] == pytest.approx(200.0, rel=1e-4)

@@ -8,10 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from agv_analysis.scenario import load_scenario
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.margins import Margins, binding, margins
+from agv_cloud.parameters import ControllerParameters
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -104,9 +107,12 @@ def test_without_a_delay_margin_there_is_a_reason(setting: str, reason: str) -> 
 
 def test_what_binds() -> None:
     """Along L T_s K_x < 2, across about L T_s v min(2 / K_theta, 2 K_theta / K_y)^-1 < 1."""
-    slow = load_scenario(str(REPOSITORY / "config/paper.yaml"), ["controller.kx=0.5"]).controller
-    assert binding(1.0, load_scenario(str(REPOSITORY / "config/paper.yaml")).controller, 0.005) == "along"
-    assert binding(20.0, slow, 0.005) == "across"
+
+    def found(v: float, by: ControllerParameters) -> str | None:
+        return binding(kanayama_loop(np.array([v]), np.zeros(1), by, 0.005))
+
+    assert found(1.0, ControllerParameters()) == "along"
+    assert found(20.0, ControllerParameters(kx=0.5)) == "across"
 
 
 def test_the_command(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_elliott
-from agv_analysis.stability.linearisation import step_matrices
+from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.mean_square import (
     along_spectral_radius,
     critical_burst,
@@ -25,6 +25,7 @@ from agv_analysis.stability.mean_square import (
     lap_growth,
     operator,
     spectral_radius,
+    step_maps,
 )
 from agv_cloud.parameters import ControllerParameters
 
@@ -36,8 +37,12 @@ TS = 0.005
 Floats = NDArray[np.float64]
 
 
-def straight(v: float = 1.0) -> tuple[Floats, Floats]:
-    return np.array([v]), np.zeros(1)
+def loop_at(v: float, w: float, by: ControllerParameters) -> LinearLoop:
+    return kanayama_loop(np.array([v]), np.array([w]), by, TS)
+
+
+def straight(by: ControllerParameters, v: float = 1.0) -> LinearLoop:
+    return loop_at(v, 0.0, by)
 
 
 def moments_by_enumeration(F: Floats, G: Floats, chain: Chain, steps: int) -> Floats:
@@ -65,42 +70,36 @@ def moments_by_enumeration(F: Floats, G: Floats, chain: Chain, steps: int) -> Fl
 )
 @pytest.mark.parametrize(("v", "w"), [(1.0, 0.0), (12.0, -3.0)])
 def test_the_recursion_is_the_mean_over_all_sequences(chain: Chain, steps: int, v: float, w: float) -> None:
-    F, G = (
-        matrices[0]
-        for matrices in step_matrices(
-            np.array([v]), np.array([w]), ControllerParameters(kx=150.0, ky=4.0, ktheta=3.0), TS
-        )
-    )
+    loop = loop_at(v, w, ControllerParameters(kx=150.0, ky=4.0, ktheta=3.0))
     size, states = 3, len(chain.delivery)
     start = np.kron(np.ones((2, 1)), np.eye(size))
     moments = np.concatenate([share * (start @ start.T).ravel() for share in chain.stationary])
-    A = operator(F, G, chain)
+    A = operator(*step_maps(loop), chain)
     assert A.shape == (states * 36, states * 36)
     for _ in range(steps):
         moments = A @ moments
     found = moments.reshape(states, 6, 6).sum(axis=0)[:3, :3]
-    np.testing.assert_allclose(found, moments_by_enumeration(F, G, chain, steps), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        found, moments_by_enumeration(loop.F[0], loop.G[0], chain, steps), rtol=1e-10, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("chain", [bernoulli(0.6), bernoulli(0.93), bursty(0.3, 4.0)])
 def test_driving_a_lap_is_the_product_of_its_operators(lap: Lap, chain: Chain) -> None:
     v, w = lap("paper", 30)[1:]
     by = ControllerParameters(kx=60.0, ky=4.0, ktheta=3.0)
-    F, G = step_matrices(12.0 * v, w, by, TS)
+    loop = kanayama_loop(12.0 * v, w, by, TS)
     product = np.eye(36 * len(chain.delivery))
     for k in range(30):
-        product = operator(F[k], G[k], chain) @ product
+        product = operator(*step_maps(loop, k), chain) @ product
     truth = math.log(np.abs(np.linalg.eigvals(product)).max())
-    assert lap_growth(12.0 * v, w, by, TS, chain) == pytest.approx(truth, abs=1e-6)
+    assert lap_growth(loop, chain) == pytest.approx(truth, abs=1e-6)
 
 
 def test_without_losses_it_is_the_square_of_the_loop() -> None:
-    F, G = (
-        M[0]
-        for M in step_matrices(np.array([2.0]), np.array([0.4]), ControllerParameters(kx=60.0, ky=4.0, ktheta=3.0), TS)
-    )
-    square = np.abs(np.linalg.eigvals(F + G)).max() ** 2
-    assert spectral_radius(F, G, bernoulli(0.0)) == pytest.approx(square, rel=1e-9)
+    loop = loop_at(2.0, 0.4, ControllerParameters(kx=60.0, ky=4.0, ktheta=3.0))
+    square = np.abs(np.linalg.eigvals(loop.F[0] + loop.G[0])).max() ** 2
+    assert spectral_radius(*step_maps(loop), bernoulli(0.0)) == pytest.approx(square, rel=1e-9)
 
 
 # -- along the track -------------------------------------------------------------------------------------------------
@@ -143,9 +142,8 @@ def test_periodic_bursts_contract_if_each_factor_does(n: int) -> None:
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight", "warehouse"])
 def test_the_canonical_scenario(lap: Lap, track: str, kx: float, p: float) -> None:
     v, w = lap(track, 2000)[1:] if track in ("eight", "warehouse") else lap(track)[1:]
-    assert critical_loss(v, w, ControllerParameters(kx=kx), TS) == pytest.approx(
-        p, abs=2e-5 if len(v) == 20_000 else 2e-3
-    )
+    loop = kanayama_loop(v, w, ControllerParameters(kx=kx), TS)
+    assert critical_loss(loop) == pytest.approx(p, abs=2e-5 if len(v) == 20_000 else 2e-3)
 
 
 @pytest.mark.parametrize(
@@ -153,18 +151,17 @@ def test_the_canonical_scenario(lap: Lap, track: str, kx: float, p: float) -> No
 )
 def test_the_critical_loss_is_where_the_operator_has_radius_one(kx: float, ky: float, ktheta: float, v: float) -> None:
     """Also where it is across the track that the moments grow."""
-    by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
-    p = critical_loss(*straight(v), by, TS)
+    loop = straight(ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), v)
+    p = critical_loss(loop)
     assert 0.0 < p <= critical_loss_along(TS * kx) + 1e-8
-    F, G = (matrices[0] for matrices in step_matrices(*straight(v), by, TS))
-    assert spectral_radius(F, G, bernoulli(p - 0.01 * (1.0 - p))) < 1.0
-    assert spectral_radius(F, G, bernoulli(p + 0.01 * (1.0 - p))) > 1.0
+    assert spectral_radius(*step_maps(loop), bernoulli(p - 0.01 * (1.0 - p))) < 1.0
+    assert spectral_radius(*step_maps(loop), bernoulli(p + 0.01 * (1.0 - p))) > 1.0
 
 
 @pytest.mark.parametrize(("loss_rate", "kx"), [(0.3, 5.0), (0.6, 5.0), (0.05, 25.0), (0.3, 25.0), (0.6, 25.0)])
 def test_the_critical_burst_on_a_line(loss_rate: float, kx: float) -> None:
     """pi B = 1/a - 1/2."""
-    found = critical_burst(loss_rate, *straight(), ControllerParameters(kx=kx), TS)
+    found = critical_burst(straight(ControllerParameters(kx=kx)), loss_rate)
     assert found * loss_rate == pytest.approx(1.0 / (TS * kx) - 0.5, rel=1e-5)
 
 
@@ -178,7 +175,7 @@ def growth_per_reception(F: Floats, G: Floats, lengths: Floats) -> float:
 
 
 def test_the_example_of_the_docs() -> None:
-    assert critical_burst(0.05, *straight(), ControllerParameters(kx=5.0), TS) == pytest.approx(346.5, abs=0.1)
+    assert critical_burst(straight(ControllerParameters(kx=5.0)), 0.05) == pytest.approx(346.5, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -187,9 +184,8 @@ def test_the_example_of_the_docs() -> None:
 )
 def test_the_critical_burst_by_renewals(loss_rate: float, kx: float, v: float, w: float) -> None:
     """Where bursts are long and rare the error across binds, because it grows with the square of their length."""
-    speeds = np.array([v]), np.array([w])
-    found = critical_burst(loss_rate, *speeds, ControllerParameters(kx=kx), TS)
-    F, G = (matrices[0] for matrices in step_matrices(*speeds, ControllerParameters(kx=kx), TS))
+    loop = loop_at(v, w, ControllerParameters(kx=kx))
+    found, F, G = critical_burst(loop, loss_rate), loop.F[0], loop.G[0]
     assert growth_per_reception(F, G, bursty(loss_rate, 0.999 * found).burst_lengths()) < 1.0
     assert growth_per_reception(F, G, bursty(loss_rate, 1.001 * found).burst_lengths()) > 1.0
     along = found * loss_rate == pytest.approx(1.0 / (TS * kx) - 0.5, rel=1e-5)
@@ -197,12 +193,12 @@ def test_the_critical_burst_by_renewals(loss_rate: float, kx: float, v: float, w
 
 
 def test_degenerate_cases() -> None:
-    assert critical_loss(*straight(), ControllerParameters(kx=200.0), TS) == pytest.approx(1.0 / 3.0)  # deadbeat
-    assert critical_loss(*straight(), ControllerParameters(kx=401.0), TS) == -1.0
-    assert critical_loss(*straight(), ControllerParameters(kx=0.0), TS) == -1.0
-    assert critical_loss(*straight(0.0), ControllerParameters(), TS) == pytest.approx(15.0 / 17.0)  # parked
-    assert critical_burst(0.3, *straight(), ControllerParameters(kx=401.0), TS) == -1.0
-    assert critical_burst(0.9, *straight(), ControllerParameters(kx=250.0), TS) == -1.0  # 0.9 needs bursts of 9 slots
+    assert critical_loss(straight(ControllerParameters(kx=200.0))) == pytest.approx(1.0 / 3.0)  # deadbeat
+    assert critical_loss(straight(ControllerParameters(kx=401.0))) == -1.0
+    assert critical_loss(straight(ControllerParameters(kx=0.0))) == -1.0
+    assert critical_loss(straight(ControllerParameters(), 0.0)) == pytest.approx(15.0 / 17.0)  # parked
+    assert critical_burst(straight(ControllerParameters(kx=401.0)), 0.3) == -1.0
+    assert critical_burst(straight(ControllerParameters(kx=250.0)), 0.9) == -1.0  # 0.9 needs bursts of 9 slots
     assert (critical_loss_along(0.0), critical_loss_along(2.0)) == (-1.0, -1.0)
     assert (critical_mean_age_along(0.0), critical_mean_age_along(2.0)) == (-1.0, -1.0)
     assert along_spectral_radius(0.5, bernoulli(1.0)) >= 1.0  # nothing is ever received
@@ -225,7 +221,7 @@ def test_the_mean_square_of_many_runs() -> None:
         held = np.where(random.random(runs) < p, held, error)
         error = error - a * held
         squares.append((error**2).mean())
-    A = operator(np.ones((1, 1)), np.full((1, 1), -a), bernoulli(p))
+    A = operator(np.array([[1.0 - a, 0.0], [1.0, 0.0]]), np.array([[1.0, -a], [0.0, 1.0]]), bernoulli(p))
     moments = np.ones(4)
     for k in range(10):
         moments = A @ moments

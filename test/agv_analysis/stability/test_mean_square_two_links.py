@@ -14,21 +14,28 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.stability import mean_square, mean_square_two_links
-from agv_analysis.stability.linearisation import HELD, Edge, seen, step_matrices
+from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.margins import margins
+from agv_analysis.stability.mean_square_two_links import independent
 from agv_cloud.parameters import ControllerParameters
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
 TS = 0.005
 GAINS = ControllerParameters(kx=60.0, ky=4.0, ktheta=6.0)
-ONE = np.full(1, 1.2), np.full(1, 0.3)
-ONE_STRAIGHT = np.ones(1), np.zeros(1)
+ONE = kanayama_loop(np.full(1, 1.2), np.full(1, 0.3), GAINS, TS)
+WRONGLY_PREDICTED = kanayama_loop(np.full(1, 1.2), np.full(1, 0.3), GAINS, TS, True, 1.4)
 
 
-def expected_square(
-    F: Floats, G: Floats, H: Floats | None, uplink: Chain, downlink: Chain, stops: bool, steps: int
-) -> float:
-    """E[|e|^2] after some steps from e = h = c = 1, channels stationary: the sum over all that can happen."""
+def straight(by: ControllerParameters) -> LinearLoop:
+    return kanayama_loop(np.ones(1), np.zeros(1), by, TS)
+
+
+def expected_square(loop: LinearLoop, uplink: Chain, downlink: Chain, stops: bool, steps: int) -> float:
+    """E[|e|^2] after some steps from e = h = 1 and their command, channels stationary: the sum over all possibilities.
+
+    The plant acts on the error c that its command was computed from.
+    """
+    F, G, H = loop.F[0], loop.G[0], None if loop.H is None else loop.H[0]
     total = 0.0
     states = list(itertools.product(range(len(uplink.delivery)), range(len(downlink.delivery))))
 
@@ -56,21 +63,20 @@ def expected_square(
 
 
 @pytest.mark.parametrize("stops", [False, True])
-@pytest.mark.parametrize("edge", [HELD, Edge(True, 0.4)])
+@pytest.mark.parametrize("loop", [ONE, WRONGLY_PREDICTED], ids=["held", "predicted"])
 @pytest.mark.parametrize(
     ("uplink", "downlink", "steps"),
     [(bernoulli(0.3), bernoulli(0.6), 5), (gilbert_elliott(0.2, 0.5), bernoulli(0.4), 4)],
 )
 def test_the_moments_are_those_of_all_that_can_happen(
-    stops: bool, edge: Edge, uplink: Chain, downlink: Chain, steps: int
+    stops: bool, loop: LinearLoop, uplink: Chain, downlink: Chain, steps: int
 ) -> None:
-    F, G = step_matrices(*ONE, GAINS, TS)
-    G, H = seen(F, G, edge)
     maps = [
-        mean_square_two_links.step_maps(F, G, H, u, d, stops)[0] for u, d in itertools.product((True, False), repeat=2)
+        mean_square_two_links.step_maps(loop, u, d, stops)[0] for u, d in itertools.product((True, False), repeat=2)
     ]
-    transition, probabilities = mean_square_two_links.joint(uplink, downlink)
-    moments = np.kron(uplink.stationary, downlink.stationary)[:, None, None] * np.ones((9, 9))
+    transition, probabilities = independent(uplink, downlink)
+    start = np.concatenate((np.ones(6), loop.L_h[0] @ np.ones(3)))
+    moments = np.kron(uplink.stationary, downlink.stationary)[:, None, None] * np.outer(start, start)
     for _ in range(steps):
         after = [
             sum(p * A @ Z @ A.T for p, A in zip(row, maps, strict=True))
@@ -78,30 +84,30 @@ def test_the_moments_are_those_of_all_that_can_happen(
         ]
         moments = np.einsum("st,sij->tij", transition, np.array(after))
     found = float(np.trace(moments.sum(axis=0)[:3, :3]))
-    truth = expected_square(F[0], G[0], None if H is None else H[0], uplink, downlink, stops, steps)
+    truth = expected_square(loop, uplink, downlink, stops, steps)
     assert found == pytest.approx(truth, rel=1e-12)
 
 
 @pytest.mark.parametrize("chain", [bernoulli(0.7), gilbert_elliott(0.1, 0.2)])
 def test_one_link_alone(chain: Chain) -> None:
     """Of a command that is held it does not matter on which link it was lost."""
-    F, G = step_matrices(*ONE, GAINS, TS)
-    truth = math.log(mean_square.spectral_radius(F[0], G[0], chain))
-    assert mean_square_two_links.lap_growth(*ONE, GAINS, TS, chain, bernoulli(0.0)) == pytest.approx(truth, abs=1e-7)
-    assert mean_square_two_links.lap_growth(*ONE, GAINS, TS, bernoulli(0.0), chain) == pytest.approx(truth, abs=1e-7)
+    truth = math.log(mean_square.spectral_radius(*mean_square.step_maps(ONE), chain))
+    for links in (independent(chain, bernoulli(0.0)), independent(bernoulli(0.0), chain)):
+        assert mean_square_two_links.lap_growth(ONE, links) == pytest.approx(truth, abs=1e-7)
 
 
 def test_the_lap_and_the_matrix_agree() -> None:
     """Two implementations: the recursion along a lap and the matrix of it."""
     speeds = np.full(2000, 1.2), np.full(2000, 0.3)
-    chains = bernoulli(0.5), gilbert_elliott(0.1, 0.3)
-    truth = 2000 * mean_square_two_links.lap_growth(*ONE, GAINS, TS, *chains)
+    links = independent(bernoulli(0.5), gilbert_elliott(0.1, 0.3))
+    truth = 2000 * mean_square_two_links.lap_growth(ONE, links)
     speeds[0][-1] = np.nextafter(1.2, 2.0)  # not constant, so that the lap is driven
-    assert mean_square_two_links.lap_growth(*speeds, GAINS, TS, *chains) == pytest.approx(truth, rel=1e-6)
+    found = mean_square_two_links.lap_growth(kanayama_loop(*speeds, GAINS, TS), links)
+    assert found == pytest.approx(truth, rel=1e-6)
 
 
 def test_a_plant_that_stops_at_every_loss_of_everything_is_open() -> None:
-    found = mean_square_two_links.lap_growth(*ONE_STRAIGHT, GAINS, TS, bernoulli(0.0), bernoulli(1.0), stops=True)
+    found = mean_square_two_links.lap_growth(straight(GAINS), independent(bernoulli(0.0), bernoulli(1.0)), stops=True)
     assert found == pytest.approx(0.0, abs=0.05)  # an error that stays, or grows as k^2 across
 
 
@@ -113,7 +119,7 @@ def test_simulated_twins_on_both_sides_of_the_border(p: float, contracts: bool) 
         "relay.uplink.model=bernoulli", f"relay.uplink.p={p}",
         "relay.downlink.model=bernoulli", f"relay.downlink.p={p}",
     ])  # fmt: skip
-    growth = mean_square_two_links.lap_growth(*ONE_STRAIGHT, wanted.controller, TS, bernoulli(p), bernoulli(p))
+    growth = mean_square_two_links.lap_growth(straight(wanted.controller), independent(bernoulli(p), bernoulli(p)))
     assert (growth < 0.0) == contracts
     square = np.mean(simulate_batch([wanted], range(1, 101), twins=True)["contraction"] ** 2)
     assert (square < 1e-3) if contracts else (square > 1e3)
@@ -123,7 +129,8 @@ def test_the_margins_have_it_where_commands_are_lost() -> None:
     lossy = ("relay.uplink.model=bernoulli", "relay.uplink.p=0.5", "relay.downlink.model=bernoulli")
     line = ("error_detector.track=line", "relay.downlink.p=0.6")
     found = margins(load_scenario(PAPER, [*lossy, *line]))
-    truth = mean_square_two_links.lap_growth(*ONE_STRAIGHT, ControllerParameters(), TS, bernoulli(0.5), bernoulli(0.6))
+    links = independent(bernoulli(0.5), bernoulli(0.6))
+    truth = mean_square_two_links.lap_growth(straight(ControllerParameters()), links)
     assert found.both_links == pytest.approx(truth, abs=1e-6)
     assert found.to_json()["both_links"] == {"mean_square_growth": found.both_links}
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability import almost_sure
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.paper import largest_n, matrices, spectral_radii
 from agv_cloud.control.kanayama import kanayama
 from agv_cloud.parameters import ControllerParameters
@@ -205,5 +206,5 @@ def test_the_table_of_the_docs(track: str) -> None:
             None if of_paper == "all" else int(of_paper)
         )
         if (track, kx) in (("paper", "25"), ("paper", "250"), ("line", "25"), ("line", "250")):
-            found = almost_sure.critical_loss(v, w, ControllerParameters(kx=float(kx)), TS)
+            found = almost_sure.critical_loss(kanayama_loop(v, w, ControllerParameters(kx=float(kx)), TS))
             assert found == pytest.approx(float(p_almost_surely), abs=2e-3)

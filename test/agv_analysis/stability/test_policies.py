@@ -15,8 +15,11 @@ from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.stability import floquet, joint_spectral_radius, mean_square
 from agv_analysis.stability.analysis import analyse
-from agv_analysis.stability.linearisation import HELD, Edge, burst_maps, seen, step_matrices
+from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
+from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.margins import margins
+from agv_analysis.stability.reception_maps import burst_maps
+from agv_analysis.stability.scenario_loop import loop_of
 from agv_cloud.parameters import ControllerParameters
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
@@ -28,6 +31,11 @@ def scenario(*settings: str) -> Scenario:
     return load_scenario(PAPER, [ON_TRACK, *settings])
 
 
+def predicting(kx: float, delta: float) -> LinearLoop:
+    """Along a line, behind a predictor that does not know that the true speed is 1 + delta times the commanded one."""
+    return kanayama_loop(np.ones(1), np.zeros(1), ControllerParameters(kx=kx), TS, True, 1.0 + delta)
+
+
 def along(a: float, delta: float, length: int) -> float:
     """Factor of the error along a straight track over a burst: 1 - (1 + delta) (1 - (1 - a)^L)."""
     return 1.0 - (1.0 + delta) * (1.0 - (1.0 - a) ** length)
@@ -35,9 +43,7 @@ def along(a: float, delta: float, length: int) -> float:
 
 @pytest.mark.parametrize("delta", [-0.3, 0.0, 0.1, 1.1])
 def test_the_maps_of_a_predictor_along_a_line_are_the_closed_form(delta: float) -> None:
-    F, G = step_matrices(np.ones(1), np.zeros(1), ControllerParameters(kx=25.0), TS)
-    G, H = seen(F, G, Edge(True, delta))
-    for length, M in enumerate(burst_maps(F, G, 60, H), start=1):
+    for length, M in enumerate(burst_maps(predicting(25.0, delta), 60), start=1):
         assert M[0, 0, 0] == pytest.approx(along(0.125, delta, length), abs=1e-12)
 
 
@@ -46,9 +52,7 @@ def test_every_outage_is_survived_within_the_bound_on_the_models_error(kx: float
     """|delta| a < 1 - |1 - a|, a = T_s K_x: the theory's; the criterion on arbitrary bursts says the same."""
     a = TS * kx
     within = abs(delta) * a < 1.0 - abs(1.0 - a)
-    found, refuted = joint_spectral_radius.largest_n(
-        np.ones(1), np.zeros(1), ControllerParameters(kx=kx), TS, limit=200, edge=Edge(True, delta)
-    )
+    found, refuted = joint_spectral_radius.largest_n(predicting(kx, delta), limit=200)
     assert (found is None and refuted is None) == within
     if not within:
         assert refuted is not None
@@ -58,7 +62,7 @@ def test_every_outage_is_survived_within_the_bound_on_the_models_error(kx: float
 
 def test_the_moments_behind_a_predictor_are_those_of_renewals() -> None:
     """E[f(L)^2] = 1 at the border, L the geometric length of a burst; speeds without curvature part the directions."""
-    p = mean_square.critical_loss(np.ones(1), np.zeros(1), ControllerParameters(kx=25.0), TS, Edge(True, 1.1))
+    p = mean_square.critical_loss(predicting(25.0, 1.1))
     lengths = np.arange(1, 4000)
     square = np.sum((1.0 - p) * p ** (lengths - 1) * np.array([along(0.125, 1.1, n) ** 2 for n in lengths.tolist()]))
     assert square == pytest.approx(1.0, abs=1e-6)
@@ -67,14 +71,12 @@ def test_the_moments_behind_a_predictor_are_those_of_renewals() -> None:
 def test_the_lap_and_the_operator_agree() -> None:
     """Two implementations: the recursion along a lap and the matrix of it."""
     gains = ControllerParameters(kx=60.0, ky=1.0, ktheta=4.0)  # no double eigenvalue, to which laps converge slowly
-    edge, chain = Edge(True, 0.4), bernoulli(0.6)
-    F, G = step_matrices(np.full(1, 1.2), np.full(1, 0.3), gains, TS)
-    true, H = seen(F, G, edge)
-    assert H is not None
-    radius = mean_square.spectral_radius(F[0], true[0], chain, H[0])
+    chain = bernoulli(0.6)
+    one = kanayama_loop(np.full(1, 1.2), np.full(1, 0.3), gains, TS, True, 1.4)
+    radius = mean_square.spectral_radius(*mean_square.step_maps(one), chain)
     speeds = np.full(400, 1.2), np.full(400, 0.3)
     speeds[0][-1] = np.nextafter(1.2, 2.0)  # not constant, so that the lap is driven
-    growth = mean_square.lap_growth(*speeds, gains, TS, chain, edge=edge)
+    growth = mean_square.lap_growth(kanayama_loop(*speeds, gains, TS, True, 1.4), chain)
     assert growth / 400 == pytest.approx(math.log(radius), abs=1e-6)
 
 
@@ -100,7 +102,7 @@ def test_a_constant_delay_behind_a_predictor_with_a_wrong_model(n: int, delta: f
     v_r, w_r = 1.5 + 0.5 * np.sin(angle), 2.0 * np.cos(angle)
     F, G = step_matrices(v_r, w_r, gains, TS)
     error = np.linalg.norm(driven_behind_a_predictor(n, F, G, delta, 50 * laps), axis=1)
-    growth = floquet.constant_delay(n, v_r, w_r, gains, TS, Edge(True, delta))
+    growth = floquet.constant_delay(kanayama_loop(v_r, w_r, gains, TS, True, 1.0 + delta), n)
     peaks = error[1:].reshape(laps, 50).max(axis=1)
     assert math.log(peaks[-1] / peaks[20]) / (laps - 21) == pytest.approx(growth, rel=0.05, abs=0.02)
 
@@ -116,9 +118,7 @@ def test_the_longest_delay_behind_a_predictor_along_a_line(delta: float, a: floa
             else abs(1.0 - a - a * delta)
         )
 
-    found = floquet.largest_constant_delay(
-        np.ones(1), np.zeros(1), ControllerParameters(kx=a / TS), TS, limit=150, edge=Edge(True, delta)
-    )
+    found = floquet.largest_constant_delay(predicting(a / TS, delta), limit=150)
     assert (found is None) == (delta < 1.0)
     if found is None:
         assert max(radius(n) for n in range(150)) < 1.0
@@ -134,8 +134,7 @@ def test_twins_behind_a_predictor_confirm_the_bursts(scale: float, n: int, contr
     )  # fmt: skip
     found = simulate_batch([wanted], [1], twins=True)["contraction"][0, 0]
     assert (found < 0.5) == contracts
-    edge = Edge.of(wanted)
-    word = joint_spectral_radius.verdict(n, np.ones(1), np.zeros(1), wanted.controller, TS, edge).verdict
+    word = joint_spectral_radius.verdict(loop_of(wanted), n).verdict
     assert (word == joint_spectral_radius.STABLE) == contracts
 
 
@@ -170,4 +169,6 @@ def test_the_verdict_knows_the_policy(policy: str, word: str) -> None:
 
 
 def test_held_is_the_default() -> None:
-    assert Edge.of(scenario()) == HELD
+    loop = loop_of(scenario())
+    assert not loop.predicts
+    assert loop.closed_form == scenario().controller

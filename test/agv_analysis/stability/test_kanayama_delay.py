@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.stability.lifted import (
+from agv_analysis.stability.kanayama_delay import (
     critical_delay_across,
     critical_delay_along,
-    largest_n,
-    largest_radius,
     spectral_radii,
     spectral_radius,
 )
+from agv_analysis.stability.lifted import largest_n, largest_radius
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
 from agv_cloud.parameters import ControllerParameters
 
@@ -70,7 +70,9 @@ def test_many_speeds_at_once(n: int, kx: float) -> None:
         for speeds in zip(v.tolist(), w.tolist(), strict=True)
     ]
     np.testing.assert_allclose(spectral_radii(n, v, w, ControllerParameters(kx=kx), TS), truth, atol=1e-9)
-    assert largest_radius(n, v, w, ControllerParameters(kx=kx), TS) == pytest.approx(max(truth), abs=1e-9)
+    assert largest_radius(kanayama_loop(v, w, ControllerParameters(kx=kx), TS), n) == pytest.approx(
+        max(truth), abs=1e-9
+    )
 
 
 def zeros_inside(radius: float, n: int, v: float, w: float, by: ControllerParameters) -> int:
@@ -99,7 +101,7 @@ def test_n_500_by_counting_zeros(v: float, w: float, kx: float) -> None:
 @pytest.mark.parametrize("track", ["paper", "line", "circle", "eight"])
 def test_the_canonical_scenario(lap: Lap, track: str, kx: float, last: int) -> None:
     v, w = lap(track)[1:]
-    assert largest_n(v, w, ControllerParameters(kx=kx), TS) == last
+    assert largest_n(kanayama_loop(v, w, ControllerParameters(kx=kx), TS)) == last
     if track != "paper":
         return
     fastest = int(np.argmax(np.abs(v) + np.abs(w)))
@@ -110,7 +112,8 @@ def test_the_canonical_scenario(lap: Lap, track: str, kx: float, last: int) -> N
 def test_a_sharp_corner_held_for_ever_allows_one_step_less(lap: Lap) -> None:
     """In the corners of the warehouse a pose that is 62 steps old is too old, by the companion matrix, too."""
     v, w = lap("warehouse")[1:]
-    assert [largest_n(v, w, ControllerParameters(kx=kx), TS) for kx in (5.0, 25.0, 250.0)] == [61, 12, 0]
+    loops = [kanayama_loop(v, w, ControllerParameters(kx=kx), TS) for kx in (5.0, 25.0, 250.0)]
+    assert [largest_n(loop) for loop in loops] == [61, 12, 0]
     sharpest = int(np.argmax(w))
     assert companion_moduli(61, float(v[sharpest]), float(w[sharpest]), ControllerParameters(kx=5.0))[0] < 1.0
     assert companion_moduli(62, float(v[sharpest]), float(w[sharpest]), ControllerParameters(kx=5.0))[0] > 1.0
@@ -156,17 +159,21 @@ def test_across_the_track_by_the_roots_of_a_polynomial(v: float, ky: float, kthe
 def test_whichever_of_along_and_across_binds(kx: float, ky: float, ktheta: float, v: float) -> None:
     by = ControllerParameters(kx=kx, ky=ky, ktheta=ktheta)
     last = next(n for n in itertools.count() if companion_moduli(n, v, 0.0, by)[0] >= 1.0) - 1
-    assert largest_n(np.array([v]), np.zeros(1), by, TS) == last
+    assert largest_n(kanayama_loop(np.array([v]), np.zeros(1), by, TS)) == last
     assert last == math.floor(min(critical_delay_along(TS * kx), critical_delay_across(v, by, TS)))
 
 
 def test_degenerate_gains_and_speeds(lap: Lap) -> None:
     v, w = lap("line")[1:]
-    assert largest_n(v, w, ControllerParameters(kx=0.0), TS) == -1  # what is off along the track stays off
-    assert largest_n(v, w, ControllerParameters(kx=200.0), TS) == 0  # deadbeat: a = 1 is on the border of n = 1
-    assert largest_n(v, w, ControllerParameters(kx=401.0), TS) == -1
-    assert largest_n(v, w, ControllerParameters(kx=25.0, ky=0.0), TS) == -1  # nothing corrects across
-    assert largest_n(0.0 * v, w, ControllerParameters(), TS) == 12  # parked: along is all that it can reach
+
+    def found(kx: float, ky: float = 1.0, speed: float = 1.0) -> int | None:
+        return largest_n(kanayama_loop(speed * v, w, ControllerParameters(kx=kx, ky=ky), TS))
+
+    assert found(0.0) == -1  # what is off along the track stays off
+    assert found(200.0) == 0  # deadbeat: a = 1 is on the border of n = 1
+    assert found(401.0) == -1
+    assert found(25.0, ky=0.0) == -1  # nothing corrects across
+    assert found(25.0, speed=0.0) == 12  # parked: along is all that it can reach
     assert critical_delay_along(1.0) == pytest.approx(1.0)
     assert (critical_delay_along(0.0), critical_delay_along(2.0)) == (0.0, 0.0)
     assert critical_delay_across(0.0, ControllerParameters(), TS) == math.inf
