@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -9,7 +10,9 @@ import numpy as np
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.reference import reference_of
-from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
+from agv_analysis.stability.derived_loop import linear_loop
+from agv_analysis.stability.error_dynamics import NoNominalMotionError
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_cloud.reference.reference import lap_steps
 
 
@@ -24,27 +27,31 @@ def lap_of(scenario: Scenario) -> Floats:
     return reference_of(scenario.error_detector, max(1, steps))
 
 
-def loop_of(scenario: Scenario) -> LinearLoop:
-    """The loop of a scenario over one lap. Raises TrackFileError if the track's file cannot be used."""
-    return loop_along(scenario, lap_of(scenario))
+def loop_on_lap(scenario: Scenario) -> LinearLoop:
+    """The loop of a scenario over one lap.
+
+    Raises TrackFileError if the track's file cannot be used, NoNominalMotionError if the loop does not settle even
+    without losses.
+    """
+    return _along(scenario, lap_of(scenario))
 
 
-def straight_loop_of(scenario: Scenario) -> LinearLoop:
-    """The loop of a scenario on a straight track at 1 m/s."""
-    return loop_along(scenario, np.array([[0.0, 0.0, 0.0, 1.0, 0.0]]))
+@functools.lru_cache(maxsize=256)
+def straight_loop_of(scenario: Scenario) -> LinearLoop | None:
+    """The loop of a scenario on a straight track at 1 m/s; None if it does not settle there even without losses."""
+    try:
+        return linear_loop(scenario, np.array([1.0]), np.array([0.0]))
+    except NoNominalMotionError:
+        return None
 
 
 def loop_of_run(run: Run) -> LinearLoop:
-    """The loop of a run over its steps."""
-    return loop_along(run.scenario, run.reference)
+    """The loop of a run over its steps, which count as a lap. Raises NoNominalMotionError as `loop_on_lap`."""
+    return _along(run.scenario, run.reference)
 
 
-def loop_along(scenario: Scenario, reference: Floats) -> LinearLoop:
-    """The loop of a scenario along any reference, rows x, y, theta, v_r, w_r, shape (N, 5).
-
-    To first order a predictor that integrates otherwise than the plant is exact.
-    """
-    return kanayama_loop(
-        reference[:, 3], reference[:, 4], scenario.controller, scenario.plant.ts,
-        predicts=scenario.error_detector.policy == "predict", speed_scale=scenario.plant.speed_scale,
-    )  # fmt: skip
+def _along(scenario: Scenario, reference: Floats) -> LinearLoop:
+    """The loop along any lap, rows x, y, theta, v_r, w_r, shape (N, 5); a law that looks ahead sees the rows to come."""
+    ahead = scenario.controller.steps_ahead
+    v_r, w_r = (np.roll(reference[:, column], -ahead) for column in (3, 4))
+    return linear_loop(scenario, v_r, w_r)

@@ -1,0 +1,43 @@
+"""Mean square where commands are lost as well as poses, with the links as a scenario has them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from agv_analysis.link.markov_channel import chain_of
+from agv_analysis.stability import mean_square_two_links
+from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts
+
+
+def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
+    name, label = "both_links.mean_square_growth", "Both links as they are, mean square"
+    relay, policy = facts.scenario.relay, facts.scenario.plant.downlink_policy
+    uplink, downlink = chain_of(relay.uplink), chain_of(relay.downlink)
+    if downlink is not None and downlink.loss_rate == 0.0:
+        yield Margin(name, label, None, reason="the downlink loses nothing", shown=False)
+        return
+    reason = ""
+    if uplink is None or downlink is None:
+        reason = "no answer: a channel is no finite Markov chain"
+    elif policy not in mean_square_two_links.POLICIES:
+        reason = f"no answer: computed for a plant that holds its command or stops, not for {policy}"
+    elif relay.downlink.correlation != 0.0:
+        reason = "no answer: computed for links that lose independently of each other"
+    if reason or uplink is None or downlink is None:
+        yield Margin(name, label, None, reason=reason)
+        return
+    links = mean_square_two_links.independent(uplink, downlink)
+    growth = mean_square_two_links.lap_growth(facts.loop, links, policy == "zero") / facts.loop.steps
+    word = "dies out" if growth < 0.0 else "grows"
+    yield Margin(name, label, growth, f"E[e^2] {word}, times {math.exp(growth):.6g} a step")
+
+
+CRITERION = Criterion(
+    key="both_links",
+    order=60,
+    title="Both links, mean square",
+    asks="Does E[|e|^2] die out if commands are lost as well as poses?",
+    assumes="Two finite Markov chains that lose independently, and a plant that holds its command or stops.",
+    margins=_margins,
+)

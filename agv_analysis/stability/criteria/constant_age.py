@@ -1,0 +1,101 @@
+"""The lifted system: what if every pose were as old as the oldest?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from agv_analysis.stability import floquet, lifted
+from agv_analysis.stability.criteria.criterion import (
+    Criterion,
+    Judgement,
+    MapColumn,
+    Margin,
+    Row,
+    RunFacts,
+    ScenarioFacts,
+    finite,
+    steps_text,
+)
+from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.margin_map_points import LIMIT, largest_delays
+
+LONGEST, LONGEST_PREDICTED = 10_000, 1000
+"""Longest constant delay [steps] that is tried; shorter behind a predictor, where each takes longer."""
+
+_PLACES = 100
+"""Places of the track that are asked at once: all of them would take longer than the lap."""
+
+
+def _judge(facts: RunFacts) -> Judgement | None:
+    if not facts.is_feasible:
+        return None
+    radius = lifted.largest_radius(facts.loop, facts.n)
+    return Judgement(
+        f"Pose always {facts.n} steps old", radius < 1.0, f"lifted system, spectral radius {radius:.6g}",
+        {"lifted_stable": radius < 1.0, "lifted_radius": finite(radius)}, radius,
+    )  # fmt: skip
+
+
+def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
+    name, label, loop = "n_max.lifted", "Pose always n steps old", facts.loop
+    limit = 0 if loop.is_exact else LONGEST_PREDICTED if loop.predicts else LONGEST
+    n = floquet.largest_constant_delay(loop, limit)
+    if n is not None:
+        yield Margin(name, label, n, steps_text(n, loop.ts))
+    elif loop.is_exact:
+        yield Margin(name, label, None, reason="no bound: an exact prediction is as good as a fresh pose")
+    else:
+        reason = f"no bound: the lap contracts for every n that was tried, up to {limit}"
+        yield Margin(name, label, None, reason=reason)
+    yield _delay(loop)
+
+
+def _delay(loop: LinearLoop) -> Margin:
+    """Sampled delay margin on a straight track, in closed form."""
+    name, label = "delay_margin", "Delay margin, straight track"
+    if loop.predicts:
+        reason = "no answer: between samples it is computed for a pose that is held; see n_max.lifted"
+        return Margin(name, label, None, reason=reason)
+    if loop.closed_form is None:
+        reason = "no answer: between samples it is computed for Kanayama's law on a unicycle; see n_max.lifted"
+        return Margin(name, label, None, reason=reason)
+    steps = lifted.critical_delay(loop)
+    if steps <= 0.0:
+        return Margin(name, label, None, reason="not met: the error does not contract even without a delay")
+    if math.isinf(steps):
+        return Margin(name, label, None, reason="no bound: no delay is too long")
+    return Margin(name, label, loop.ts * steps, f"{loop.ts * steps * 1e3:.4g} ms")
+
+
+def _at_once(facts: RunFacts) -> Iterable[Row]:
+    loop, n, label = facts.loop, facts.n, "Pose always that old"
+    if loop.is_exact:
+        yield label, "predicted: with an exact model as without outages"
+    elif loop.is_constant or (loop.closed_form is not None and not loop.predicts):
+        places = np.arange(0, loop.steps, max(1, loop.steps // _PLACES))  # quarters of a lap that are alike stay so
+        radius = lifted.largest_radius(loop if loop.is_constant else loop.at(places), n)
+        yield label, f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
+    if loop.closed_form is not None:
+        but, delay = ", without the predictor" if loop.predicts else "", lifted.critical_delay(loop)
+        yield "Straight track, delay", f"below {delay * loop.ts * 1e3:.4g} ms{but}" if delay > 0.0 else "none"
+
+
+def _of_loop(loop: LinearLoop) -> int:
+    found = floquet.largest_constant_delay(loop, LONGEST_PREDICTED if loop.predicts else LONGEST)
+    return LIMIT if found is None else found
+
+
+CRITERION = Criterion(
+    key="lifted",
+    order=20,
+    title="Pose always n steps old",
+    asks="Does a small error die out if every pose that the edge uses is n steps old?",
+    assumes="A constant delay; outages make the age a sawtooth, which is less.",
+    judge=_judge,
+    margins=_margins,
+    at_once=_at_once,
+    map_column=MapColumn("n_lifted", "largest constant n", largest_delays, _of_loop),
+)

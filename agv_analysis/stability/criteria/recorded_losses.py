@@ -1,0 +1,56 @@
+"""The losses of a run, again and again: what they do to a small error, about the reference and about the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from agv_analysis.run import Run
+from agv_analysis.stability import driven_motion, floquet, variable_delay
+from agv_analysis.stability.criteria.criterion import Criterion, Judgement, RunFacts, finite, has_late
+from agv_analysis.stability.linear_loop import LinearLoop
+
+
+def _judge(facts: RunFacts) -> Judgement | None:
+    of_losses, of_motion = _contractions(facts) if facts.is_feasible else (None, None)
+    values = {"floquet_multiplier_per_step": of_losses, "contraction_per_step": of_motion}
+    if of_losses is None:
+        return Judgement("These very losses", None, "", values)
+    motion = "" if of_motion is None else f", {of_motion:.6g} about the motion"
+    why = f"times {of_losses:.6g} a step about the reference{motion}"
+    return Judgement("These very losses", of_losses < 1.0, why, values, (of_losses, of_motion))
+
+
+def _contractions(facts: RunFacts) -> tuple[float | None, float | None]:
+    """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
+    run, loop = facts.run, facts.loop
+    if facts.is_late:
+        return _late_contraction(run, loop), None
+    first = int(np.argmin(run.lost))
+    steps = len(run) - first
+    if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
+        return None, None
+    with np.errstate(all="ignore"):
+        of_losses = floquet.drop_sequence(loop.at(np.arange(first, len(run))), run.lost[first:], 1)
+        per_step = finite(float(np.exp(of_losses[0] / steps)))
+        of_motion = driven_motion.growth(run, first)
+    return per_step, None if of_motion is None else finite(float(np.exp(of_motion / steps)))
+
+
+def _late_contraction(run: Run, loop: LinearLoop) -> float | None:
+    """Growth factor per step about the reference from the first step on; None for what `variable_delay` cannot say."""
+    is_whole = run.k[0] == 0 and int(run.k[-1]) + 1 == len(run)
+    if loop.predicts or not is_whole or has_late(run.downlink):
+        return None
+    with np.errstate(all="ignore"):
+        growth = variable_delay.age_sequence(loop, run.n_ul)
+    return finite(float(np.exp(growth / len(run))))
+
+
+CRITERION = Criterion(
+    key="recorded_losses",
+    order=70,
+    title="These very losses",
+    asks="What does the run's own sequence of losses do to a small error, if it comes again and again?",
+    assumes="Nothing of the channel; it says of this one run only.",
+    judge=_judge,
+)
