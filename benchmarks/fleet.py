@@ -83,7 +83,8 @@ def run(count: int, first: int, number: int) -> int:
 
     Says when all of them run; the window begins with a line on standard input.
     """
-    from agv_analysis.runtime.runner import OneProcess, loop_of, run_loops
+    from agv_analysis.runtime.one_process import OneProcess
+    from agv_analysis.runtime.runner import loop_of, run_loops
     from agv_ros.executor import EXECUTORS, stop_on_signals
 
     scenario = load_scenario(CONFIG, ["plant.clock=realtime", "plant.duration=1000.0"])

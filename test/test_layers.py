@@ -19,7 +19,10 @@ LAYERS = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|(rosidl|ament|rmw|rosbag2|tf2|launch)(_.*)?")
 """Packages that there are on a machine with ROS only."""
 
-SPEAK_ROS = {"agv_ros.node", "agv_ros.executor", "agv_analysis.runtime.runner", "agv_analysis.runtime.processes"}
+SPEAK_ROS = {
+    "agv_ros.node", "agv_ros.executor",
+    "agv_analysis.runtime.one_process", "agv_analysis.runtime.runner", "agv_analysis.runtime.processes",
+}  # fmt: skip
 """Beside the nodes themselves."""
 
 

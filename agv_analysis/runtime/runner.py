@@ -3,38 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import rclpy
 import rclpy.logging
 from rclpy.executors import Executor
-from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from agv_analysis.runtime.edge_inputs import EdgeInputs
-from agv_analysis.runtime.parameters import RecorderParameters
+from agv_analysis.runtime.one_process import OneProcess
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.runtime.replay_node import Pace, ReplayNode, ReplayRecorder
+from agv_analysis.runtime.run_setup import PATIENCE, params_file, recording_of, scenario_that_waits
+from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
-from agv_plant.radio.channel import check_length
 from agv_plant.relay_node import RelayNode
-from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals
 from agv_ros.messages import Command, TrackingError
-from agv_ros.node import LoopNode, overrides
+from agv_ros.node import LoopNode
 from agv_ros.parameters import LoopParameters
-
-N = TypeVar("N", bound=LoopNode[Any])
-R = TypeVar("R", bound=RecorderNode)
 
 NODES: dict[str, Callable[..., LoopNode[Any]]] = {
     "plant": PlantNode,
@@ -43,17 +35,8 @@ NODES: dict[str, Callable[..., LoopNode[Any]]] = {
     "controller": ControllerNode,
 }
 
-_PATIENCE = 15.0
-"""How long [s] a run that is interrupted waits for its recorder, if there is one that lags: nothing shall be lost.
-
-DDS says only every 3 s that a message is there which a busy reader has missed.
-"""
-
 _EVENTS_PER_LOOK = 256
 """How many events pass between two calls of `progress`."""
-
-_OWN_TOPICS = ["--ros-args", "-r", "/clock:=clock", "-r", "/diagnostics:=diagnostics"]
-"""What makes of the topics of all nodes those of a namespace: each vehicle of a fleet has a clock of its own."""
 
 Progress = Callable[[int], None]
 """Called with the number of steps done, every now and then."""
@@ -145,52 +128,6 @@ def replay_in_process(
         return outcome, player.errors, player.commands
 
 
-class OneProcess:
-    """Nodes of this process, in a context of their own."""
-
-    def __init__(self, namespace: str = "") -> None:
-        self.context = rclpy.Context()
-        self._contexts: dict[int, rclpy.Context] = {}
-        self._namespace = namespace
-        self._stack = ExitStack()
-
-    def __enter__(self) -> OneProcess:
-        self._enter_domain(self.context, None)
-        return self
-
-    def _enter_domain(self, context: rclpy.Context, domain_id: int | None) -> None:
-        rclpy.init(context=context, domain_id=domain_id, signal_handler_options=SignalHandlerOptions.NO)
-        self._contexts[context.get_domain_id()] = context
-        self._stack.callback(context.try_shutdown)
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def add(
-        self, make: Callable[..., N], settings: object, use_sim_time: bool = False, domain_id: int = -1,
-        vehicle: str = "",
-    ) -> N:  # fmt: skip
-        """Make a node with these settings, in a DDS domain of its own if it is to have one.
-
-        The nodes of a `vehicle` of a fleet have this namespace, and in it clock and diagnostics of their own.
-        """
-        if domain_id >= 0 and domain_id not in self._contexts:
-            self._enter_domain(rclpy.Context(), domain_id)
-        node = make(
-            parameter_overrides=[*overrides(settings), Parameter("use_sim_time", value=use_sim_time)],
-            context=self._contexts.get(domain_id, self.context), use_global_arguments=False,
-            namespace=vehicle or self._namespace, cli_args=_OWN_TOPICS if vehicle else None,
-        )  # fmt: skip
-        self._stack.callback(node.destroy_node)
-        return node
-
-    def add_recorder(self, settings: RecorderParameters, make: Callable[..., R], vehicle: str = "") -> R:
-        """Make a recorder, which says in the run's Outcome alone what it has recorded."""
-        recorder = self.add(make, settings, vehicle=vehicle)
-        recorder.get_logger().set_level(rclpy.logging.LoggingSeverity.WARN)
-        return recorder
-
-
 class Loop(NamedTuple):
     """The nodes of one loop."""
 
@@ -226,12 +163,12 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
         spin(executor, watch.is_done)
         watch.look()
     finally:  # whatever ended the loops, what was recorded is kept
-        deadline = time.monotonic() + _PATIENCE
+        deadline = time.monotonic() + PATIENCE
         nodes = [node for loop in loops for node in loop.nodes]
         for node in nodes:
             node.close()
         recorders = [(loop.recorder, len(loop.nodes)) for loop in loops if loop.recorder]
-        spin_for(executor, lambda: all(recorder.has_all_of(number) for recorder, number in recorders), _PATIENCE)
+        spin_for(executor, lambda: all(recorder.has_all_of(number) for recorder, number in recorders), PATIENCE)
         for node in nodes:  # others may listen, too
             node.flush(max(0.0, deadline - time.monotonic()))
         for recorder, _ in recorders:
@@ -264,61 +201,3 @@ class _Watch:
         for plant, pace in zip(self._plants, self.paces, strict=True):
             pace.see(plant.k)
         self._progress(sum(plant.k for plant in self._plants))
-
-
-def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
-    """The scenario with nodes that wait for each other, and for the recorder.
-
-    Raises TraceError as the nodes would, and UserError if they would wait for ever.
-    """
-    if scenario.error_detector.trigger == "timer" and scenario.plant.clock == "lockstep":
-        raise UserError(
-            "error_detector.trigger is timer, but plant.clock is lockstep, in which the plant waits for an answer to "
-            "each of its steps: set plant.clock=realtime"
-        )
-    steps = scenario.plant.duration / scenario.plant.ts
-    for channel in (scenario.relay.uplink, scenario.relay.downlink):
-        check_length(channel, steps)
-    met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": _PATIENCE if recorded else scenario.plant.stop_timeout}
-    nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
-    if scenario.error_detector.hears_commands and not scenario.plant.plan_steps:
-        nodes["controller"] = dataclasses.replace(nodes["controller"], wait_for_subscribers=2 + recorded)
-    return Scenario(**nodes)
-
-
-def recording_of(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
-    """What the recorder of a scenario is to do; `params` is the file of its parameters."""
-    log_time = "stamp" if scenario.plant.clock == "lockstep" else "receive"
-    return RecorderParameters(
-        bag=str(bag), params_file=str(params), log_time=log_time, stop_timeout=_PATIENCE,
-        plant_domain_id=scenario.relay.plant_domain_id, edge_domain_id=scenario.relay.edge_domain_id,
-    )  # fmt: skip
-
-
-@contextmanager
-def params_file(scenario: Scenario) -> Iterator[Path]:
-    """A file with the scenario's parameters, for as long as it is needed."""
-    with tempfile.TemporaryDirectory(prefix="agv_ncs_") as folder:
-        path = Path(folder) / "params.yaml"
-        path.write_text(scenario.to_yaml(), encoding="utf-8")
-        yield path
-
-
-class Speedometer:
-    """Speed between the first and the last step that was seen."""
-
-    def __init__(self) -> None:
-        self._first: tuple[int, float] | None = None
-        self._last = (0, 0.0)
-
-    def see(self, steps: int) -> None:
-        """So many steps are done now."""
-        if steps > self._last[0]:
-            self._last = (steps, time.monotonic())
-            self._first = self._first or self._last
-
-    @property
-    def rate(self) -> float:
-        """Steps per second."""
-        (k, begun), (end_k, ended) = self._first or self._last, self._last
-        return (end_k - k) / (ended - begun) if end_k > k else 0.0

@@ -23,9 +23,10 @@ from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.page import render
 from agv_analysis.run import Run
 from agv_analysis.runtime.edge_comparison import compare
+from agv_analysis.runtime.one_process import OneProcess
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.runtime.recorder_node import RecorderNode
-from agv_analysis.runtime.runner import NODES, OneProcess
+from agv_analysis.runtime.runner import NODES
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.analysis import analyse
 from agv_cloud.controller_node import ControllerNode

@@ -111,7 +111,8 @@ def test_whoever_listens_gets_both_frames(of_another_type: None, prefix: str) ->
     from geometry_msgs.msg import PoseStamped, TransformStamped
     from rclpy.node import Node
 
-    from agv_analysis.runtime.runner import NODES, OneProcess
+    from agv_analysis.runtime.one_process import OneProcess
+    from agv_analysis.runtime.runner import NODES
     from agv_ros.executor import EXECUTORS, spin_for
     from agv_ros.node import LOOP_QOS
 
