@@ -38,8 +38,9 @@ def command(
       agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
       agv-ncs analyse robot --pose-topic /odom --command-topic /cmd_vel --reference-topic /plan
     """
-    from agv_analysis.recordings.other_robots import read_robot_run, read_topics
+    from agv_analysis.recordings.other_robots import read_robot_run
     from agv_analysis.recordings.recording import read_run
+    from agv_analysis.recordings.robot_topics import read_topics
     from agv_analysis.report.overview import draw
     from agv_analysis.report.table import print_table
     from agv_analysis.stability.analysis import analyse, observe

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
+from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.run import Floats
 from agv_ros.errors import UserError
 from agv_ros.messages import yaw_of_quaternion
 from agv_ros.stamps import NS_PER_S
-
-Steps = NDArray[np.int64]
 
 POSES = {
     "geometry_msgs/msg/PoseStamped": "pose",
@@ -63,12 +62,6 @@ def messages_of(bag: Bag, topic: str, kinds: tuple[str, ...], what: str) -> NDAr
     if not len(messages):
         raise UserError(f"{bag.path}: {topic} has no message, so there is no {what}")
     return messages
-
-
-def stamps_of(messages: NDArray[np.void], header: str = "header") -> Steps:
-    """Stamps [ns] of messages, in the shape of the field `header`, the path of a std_msgs/Header."""
-    seconds = messages[f"{header}.stamp.sec"].astype(np.int64)
-    return np.asarray(seconds * NS_PER_S + messages[f"{header}.stamp.nanosec"])
 
 
 def read_poses(bag: Bag, topic: str, what: str = "pose") -> Track:

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
+from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.recordings.posture_track import (
-    Steps,
     Track,
     by_the_clock_of,
     frame_of,
     in_order,
     messages_of,
     read_poses,
-    stamps_of,
     with_speeds,
     yaws_of,
 )
@@ -36,7 +35,7 @@ def read_reference(bag: Bag, topic: str, poses: Track) -> Track:
     if bag.topics[topic].type == "nav_msgs/msg/Odometry":
         return read_poses(bag, topic, "reference")
     own = np.arange(messages["poses.pose.position.x"].shape[1]) < messages["len(poses)"][:, np.newaxis]
-    stamps, where = stamps_of(messages, "poses.header"), f"{bag.path}: {topic}"
+    stamps, where = stamps_of(messages, "poses.header.stamp"), f"{bag.path}: {topic}"
     if any(len(np.unique(plan[there])) > 1 for plan, there in zip(stamps, own, strict=True)):
         return _of_timed_paths(messages, stamps, own, where, topic)
     return _of_paths_without_times(messages, own, poses, where, topic)

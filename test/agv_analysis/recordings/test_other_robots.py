@@ -15,8 +15,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.metrics.convergence import wrapped
-from agv_analysis.recordings.other_robots import RobotTopics, read_robot_run, read_topics
+from agv_analysis.recordings.other_robots import read_robot_run
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.recordings.robot_topics import RobotTopics, read_topics
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
