@@ -51,7 +51,8 @@ def command(
     from rich.console import Console
     from rich.table import Table
 
-    from agv_analysis.link.channel_study import draw, fitted, study, write_csv
+    from agv_analysis.link.channel_files import draw, write_csv
+    from agv_analysis.link.channel_study import fitted, study
     from agv_analysis.link.netem import from_netem as channel_of
     from agv_analysis.link.netem import to_netem
     from agv_analysis.scenario import load_scenario

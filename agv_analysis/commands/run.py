@@ -82,7 +82,7 @@ def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, p
     from agv_analysis.bags.writer import new_directory
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.runtime.fleet import to_json, vehicle_names, vehicle_scenarios
-    from agv_analysis.sweep.summary import write_rows
+    from agv_analysis.sweep.rows_file import write_rows
 
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
     with needs_ros():

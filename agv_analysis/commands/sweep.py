@@ -92,7 +92,7 @@ def command(
 
 def _report(sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], out: Path | None, suffix: str) -> None:
     from agv_analysis.sweep.picture import can_draw, draw
-    from agv_analysis.sweep.summary import write_rows
+    from agv_analysis.sweep.rows_file import write_rows
 
     if len(rows) <= _LONGEST_TABLE:
         _print_rows(sweep, rows)
@@ -109,14 +109,14 @@ def _report(sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], 
 def _pages(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None, figures: Path | None) -> None:
     """Write what `with_report` asks for."""
     if report is not None:
-        from agv_analysis.report.sweep import write_sweep_report
+        from agv_analysis.report.sweep_page import write_sweep_report
 
         axes = " ".join(f"--vary {axis.name}={','.join(map(str, axis.values))}" for axis in sweep.axes)
         command = f"agv-ncs sweep params.yaml {axes} --seeds {len(sweep.seeds)} --report report.html"
         write_sweep_report(sweep, rows, report, command)
         click.echo(f"report:  {report}")
     if figures is not None and rows:
-        from agv_analysis.report.sweep import draw_sweep_figures
+        from agv_analysis.report.sweep_page import draw_sweep_figures
 
         draw_sweep_figures(sweep, rows, figures)
         click.echo(f"figures: {figures}")

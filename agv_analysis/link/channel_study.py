@@ -6,10 +6,8 @@ are all lost with probability P(n_ul >= j) = pi D (T D)^(j-1) 1; the age's distr
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,10 +21,6 @@ from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.link_loop import empty_trace, listen
 from agv_plant.channels.rayleigh import fades_per_metre, loss_rate
 from agv_plant.parameters import ChannelParameters
-from agv_ros.errors import UserError
-
-DRAWN = 1000
-"""Slots that the picture shows one by one."""
 
 
 class Expected(NamedTuple):
@@ -149,47 +143,3 @@ def fitted(lost: Outcomes, channel: ChannelParameters) -> ChannelParameters:
     if fit.model == "gilbert_elliott" and fit.p is not None and fit.r is not None:
         return replace(channel, model=fit.model, p=fit.p.value, r=fit.r.value, h=0.0, k=1.0)
     return replace(channel, model=fit.model, p=fit.loss_rate.value)
-
-
-COLUMNS = ("n_ul", "slots", "share", "closed_form")
-
-
-def write_csv(path: Path, found: ChannelStudy) -> None:
-    """Write the distribution of the age, a row an age; the last column is empty without a closed form.
-
-    Raises UserError if the file cannot be written.
-    """
-    counts = np.bincount(found.age).tolist()
-    expected = found.expected_age_shares
-    closed = [""] * len(counts) if expected is None else expected.tolist()
-    try:
-        with open(path, "w", encoding="utf-8", newline="") as file:
-            rows = csv.writer(file)
-            rows.writerow(COLUMNS)
-            rows.writerows(zip(range(len(counts)), counts, found.age_shares.tolist(), closed, strict=True))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def draw(path: Path, found: ChannelStudy) -> None:
-    """Draw the age slot by slot, and its distribution beside the closed form. Raises UserError if that fails."""
-    from matplotlib.figure import Figure
-
-    from agv_analysis.report.overview import DRIVEN, LOST
-
-    figure = Figure(figsize=(11.0, 4.0), layout="constrained")
-    course, shares = figure.subplots(1, 2)
-    course.step(np.arange(len(found.age))[:DRAWN], found.age[:DRAWN], where="post", color=LOST, lw=0.8)
-    course.set(xlabel="slot k", ylabel="n_ul [slots]", title=f"{found.channel.model}: the first slots")
-    measured, expected = found.age_shares, found.expected_age_shares
-    shares.plot(np.flatnonzero(measured), measured[measured > 0.0], "o", color=DRIVEN, ms=3.0, label="these slots")
-    if expected is not None:
-        shares.plot(
-            np.flatnonzero(expected > 0.0), expected[expected > 0.0], color="black", lw=0.8, label="closed form"
-        )
-    shares.set(yscale="log", xlabel="n_ul [slots]", ylabel="share of slots", title="Age of information")
-    shares.legend(loc="best", fontsize="small")
-    try:
-        figure.savefig(path, dpi=130)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: cannot be drawn to: {error}") from None

@@ -1,5 +1,12 @@
-"""A run for people to look at: one page without a network, and figures for a paper.
+"""A run for people to look at: on the terminal, on one page without a network, and as figures for a paper.
 
-`panels` says what is drawn, named lines on named axes, whatever draws them. `plotly` makes figures of plotly.js of
-them, `page` the report, one HTML file; `figures` draws them through matplotlib, as SVG and PDF.
+table               the figures of an analysis on the terminal, of one run or of several side by side
+verdict_sentence    the verdict in one sentence
+panels              what is drawn, named lines on named axes, whatever draws them
+plotly              panels as figures of plotly.js
+matplotlib_figures  panels as figures for a paper, SVG and PDF
+overview            four panels on one sheet
+margin_table        margins over the track as rows
+page                the report of a run, one HTML file
+sweep_page          the report of a sweep
 """

@@ -1,4 +1,4 @@
-"""Panels as figures for a paper: one column wide, SVG and PDF, with all letters in the file."""
+"""Panels drawn by matplotlib; as figures for a paper: one column wide, SVG and PDF, with all letters in the file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def draw_figures(panels: Iterable[Panel], folder: Path) -> list[Path]:
         for panel in panels:
             with mpl.rc_context(STYLE):
                 figure = Figure(figsize=(WIDTH, WIDTH if panel.equal else 0.62 * WIDTH), layout="constrained")
-                _draw(figure.add_subplot(), panel)
+                draw_panel(figure.add_subplot(), panel)
                 for suffix, metadata in (("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
                     drawn.append(folder / f"{panel.key}.{suffix}")
                     figure.savefig(drawn[-1], metadata=metadata)
@@ -49,7 +49,8 @@ def draw_figures(panels: Iterable[Panel], folder: Path) -> list[Path]:
     return drawn
 
 
-def _draw(axes: Axes, panel: Panel) -> None:
+def draw_panel(axes: Axes, panel: Panel) -> None:
+    """Draw a panel on axes of matplotlib."""
     for line in panel.lines:
         _draw_line(axes, thinned(line, _MOST_POINTS))
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)

@@ -17,10 +17,10 @@ import numpy as np
 
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
+from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.run import Run
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
-from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 from agv_analysis.version import version
 from agv_ros.errors import UserError
 
@@ -29,50 +29,6 @@ _FEW = 2000
 
 _HEIGHTS = {"time": 820}
 _HEIGHT = 460
-
-
-def sentence(analysis: Observations) -> str:
-    """The verdict in one sentence for people who do not know the criteria."""
-    if analysis.run.unexplained:
-        return "This recording proves nothing: messages are missing that no channel lost."
-    if not isinstance(analysis, Analysis):
-        return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
-    word, met = analysis.verdict.word, _met(analysis)
-    if word == MEAN_SQUARE and analysis.run.downlink_lost.any():
-        return (
-            "The AGV keeps to its track on radio links like these, which lose commands as well, but not in every case."
-        )
-    if word == ASYMPTOTIC and analysis.n == 0:
-        return "The AGV keeps to its track; no update was lost."
-    if word == ASYMPTOTIC and _is_late(analysis):
-        return f"The AGV keeps to its track with {met}."
-    if word == ASYMPTOTIC:
-        return f"The AGV keeps to its track under {met}, or shorter ones, in any order."
-    if word == MEAN_SQUARE:
-        return (
-            f"The AGV keeps to its track on a radio link like this one, but not in every case: {met}, again and again, "
-            "would throw it off."
-        )
-    if word == UNKNOWN:
-        return f"Whether the loop is stable cannot be said: {analysis.verdict.margin.removeprefix('unknown: ')}."
-    if word == BOUNDED:
-        return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
-    return f"The AGV does not keep to its track: {met} are too much for these gains."
-
-
-def _is_late(analysis: Observations) -> bool:
-    """Were poses older than outages make them? Messages were delayed, then."""
-    return analysis.n > analysis.outages.uplink.longest
-
-
-def _met(analysis: Observations) -> str:
-    """The worst that the run has met."""
-    age = f"{analysis.n * analysis.run.ts * 1e3:g} ms"
-    if _is_late(analysis):
-        return f"poses up to {analysis.n} steps ({age}) old"
-    if analysis.run.downlink_lost.any():
-        return "losses on both links, of poses and of commands,"
-    return f"outages of {analysis.n} lost updates in a row ({age})"
 
 
 def write_report(analysis: Observations, path: Path) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.metrics.convergence import TOLERANCE, body_errors, wrapped
-from agv_analysis.report.overview import SMALLEST, within
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import lifted, paper
 from agv_analysis.stability.analysis import Analysis, Observations, paper_inputs
@@ -22,6 +21,9 @@ LINE, STEP, DOTS, BARS = "line", "step", "dots", "bars"
 
 REFERENCE, DRIVEN, LOST, OTHER, LIMIT = "reference", "driven", "lost", "other", "limit"
 """What a line stands for, which gives it its colour."""
+
+SMALLEST = 1e-6
+"""Errors [m] below this are drawn at it: a logarithm has no zero."""
 
 LARGEST_LIFTED = 600
 """Multipliers of a larger lifted system are not computed: 3 (n + 1) of them take its cube in time."""
@@ -92,6 +94,13 @@ def track(run: Run) -> Panel:
         Line("pose lost", x[run.lost], y[run.lost], LOST, DOTS, why),
     )
     return Panel("track", "Track", "x [m]", "y [m]", lines[: 3 if run.lost.any() else 2], equal=True)
+
+
+def within(values: Floats, reference: Floats) -> Floats:
+    """Values that lie within some laps of the reference; what is far away would shrink the track to a point."""
+    reach = 2.0 * (np.ptp(reference) + 10.0)
+    near = np.abs(values - np.mean(reference)) <= reach
+    return np.where(near, values, np.nan)
 
 
 def distance(run: Run) -> Panel:

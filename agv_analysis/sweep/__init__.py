@@ -3,8 +3,11 @@
     plan      what is to be run: axes, points, seeds, and the parts that it is done in
     execute   parts on all cores of this machine, or on a Dask cluster
     store     parts kept on disk as they are done, so that a sweep that was stopped can go on
+    collect   all rows, from the parts that are done and those that are still to be run
     summary   one row a point: probability of instability with its confidence interval, quantiles of the metrics
-    picture   curve or heat map of a metric, with the border of mean-square stability
+    rows_file rows as CSV or Parquet
+    borders   where the loop ceases to be stable along a straight track, by theory
+    picture   curve or heat map of a metric, with these borders
 
 Seeds are paired: under one seed all points with the same channel meet the same outages.
 """

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import importlib
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +12,7 @@ from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.run import Floats
 from agv_analysis.simulation.batch import Table
 from agv_analysis.sweep import METRICS
-from agv_analysis.sweep.plan import Sweep, SweepError
+from agv_analysis.sweep.plan import Sweep
 from agv_analysis.version import version
 
 
@@ -58,26 +55,3 @@ def quantiles(values: Floats, settling: bool) -> tuple[float, float]:
         return math.nan, math.nan
     p50, p95 = np.percentile(values, [50.0, 95.0], method="inverted_cdf")
     return float(p50), float(p95)
-
-
-def write_rows(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write rows to a .csv or a .parquet file. Raises SweepError if that cannot be done."""
-    try:
-        if path.suffix == ".parquet":
-            _write_parquet(rows, path)
-        else:
-            with open(path, "w", encoding="utf-8", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
-    except OSError as error:
-        raise SweepError(f"{path}: cannot be written: {error}") from None
-
-
-def _write_parquet(rows: list[dict[str, Any]], path: Path) -> None:
-    try:
-        arrow: Any = importlib.import_module("pyarrow")
-        parquet: Any = importlib.import_module("pyarrow.parquet")
-    except ImportError:
-        raise SweepError(f"{path}: Parquet needs pyarrow: pip install pyarrow, or take --format csv") from None
-    parquet.write_table(arrow.Table.from_pylist(rows), path)

@@ -22,7 +22,7 @@ import pytest
 from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside, lap_rows
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
-from agv_analysis.report.page import sentence
+from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import analyse

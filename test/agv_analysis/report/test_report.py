@@ -17,9 +17,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.matplotlib_figures import draw_figures
-from agv_analysis.report.page import render, sentence, write_report
+from agv_analysis.report.page import render, write_report
 from agv_analysis.report.panels import LINE, Line, lifted_multipliers, panels, paper_eigenvalues, thinned, track
-from agv_analysis.report.sweep import sweep_figure, write_sweep_report
+from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
+from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import Analysis, analyse, observe

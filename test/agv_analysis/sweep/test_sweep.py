@@ -19,12 +19,14 @@ from agv_analysis.cli import main
 from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate_batch
+from agv_analysis.sweep.borders import margins
 from agv_analysis.sweep.collect import collect
 from agv_analysis.sweep.execute import Results, on_dask, on_this_machine, run_part
-from agv_analysis.sweep.picture import draw, margins
+from agv_analysis.sweep.picture import draw
 from agv_analysis.sweep.plan import Part, Sweep, SweepError, parse_axis
+from agv_analysis.sweep.rows_file import write_rows
 from agv_analysis.sweep.store import Store
-from agv_analysis.sweep.summary import quantiles, write_rows
+from agv_analysis.sweep.summary import quantiles
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")

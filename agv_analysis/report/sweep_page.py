@@ -12,7 +12,8 @@ import numpy as np
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, plain
 from agv_analysis.report.plotly import figure
-from agv_analysis.sweep.picture import BORDERS, across_and_up, border_maps, border_places, can_draw, draw
+from agv_analysis.sweep.borders import border_maps, border_places
+from agv_analysis.sweep.picture import COLOURS, across_and_up, can_draw, draw
 from agv_analysis.sweep.plan import Axis, Sweep
 from agv_ros.errors import UserError
 
@@ -99,7 +100,7 @@ def _borders(sweep: Sweep, across: Axis, up: Axis) -> Iterator[dict[str, Any]]:
 
 
 def _border(name: str, kind: str, x: Any, y: Any) -> dict[str, Any]:
-    line = {"color": BORDERS[name], "dash": "dash", "width": 2}
+    line = {"color": COLOURS[name], "dash": "dash", "width": 2}
     return {
         "type": kind, "name": f"border: {name}", "x": x, "y": y, "line": line, "showlegend": True, "hoverinfo": "skip",
     }  # fmt: skip
