@@ -11,7 +11,7 @@ import numpy as np
 
 from agv_analysis.bags.bag_errors import DamagedError
 from agv_analysis.bags.checksum import crc32
-from agv_analysis.bags.chunk_index import survey
+from agv_analysis.bags.chunk_index import index_chunk
 from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
 from agv_analysis.bags.message_batch import Bytes, Ints, numbers_at
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Index, Read, has_shape, is_known
@@ -145,7 +145,7 @@ def cut_chunk(length: int, left: int, read: Read) -> bytes | None:
 
 def sort_out(content: bytes, indexes: list[Index], is_large: bool) -> tuple[Content, bool]:
     """Messages of a chunk, and whether its message indexes name exactly these; `is_large`: compiled code pays."""
-    if is_large and (found := survey(content)) is not None:
+    if is_large and (found := index_chunk(content)) is not None:
         bounds = [0, *found.ends.tolist()]
         messages = {
             channel: Messages(found.starts[begin:end], found.lengths[begin:end])

@@ -13,7 +13,7 @@ from agv_analysis.compiled import HAS_NUMBA, compiled
 _RECORD = RECORD.size
 
 
-class Survey(NamedTuple):
+class ChunkIndex(NamedTuple):
     """The messages of a chunk, those of one channel side by side, each channel's in the order of the file."""
 
     starts: Ints
@@ -24,16 +24,16 @@ class Survey(NamedTuple):
     """Where in these arrays the messages of each channel number end, shape (highest number + 1,)."""
 
 
-def survey(content: bytes) -> Survey | None:
+def index_chunk(content: bytes) -> ChunkIndex | None:
     """The messages of a chunk of messages alone; None if there is anything else in it, or no compiler."""
     if not HAS_NUMBA:
         return None
-    found = Survey(*compiled(survey_of)(np.frombuffer(content, np.uint8)))
+    found = ChunkIndex(*compiled(index_of_chunk)(np.frombuffer(content, np.uint8)))
     return found if len(found.starts) else None
 
 
-def survey_of(content: Bytes) -> tuple[Ints, Ints, Ints]:
-    """`Survey` as a tuple, empty if the content is not filled by messages. Written to be compiled."""
+def index_of_chunk(content: Bytes) -> tuple[Ints, Ints, Ints]:
+    """`ChunkIndex` as a tuple, empty if the content is not filled by messages. Written to be compiled."""
     room = len(content) // (_RECORD + MESSAGE_HEAD) + 1
     positions, channels = np.empty(room, np.int32), np.empty(room, np.int32)
     count, highest, position = 0, 0, 0

@@ -1,4 +1,4 @@
-"""The fast lane of a table: messages of known layouts go from the chunk to their rows in one compiled loop.
+"""Messages of known layouts go from the chunk to their rows of a table in one compiled loop.
 
 numpy does the same in a dozen calls for each topic of each chunk (`Table`), which is as fast as small bags need it;
 compiled code takes a quarter of a second to be loaded, and a few seconds to be made the first time.

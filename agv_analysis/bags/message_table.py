@@ -15,7 +15,7 @@ from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.compiled_decoder import MAX_LAYOUTS, Run, compiled_place, recipes
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
 from agv_analysis.bags.message_batch import Batch, Bytes, Group, Ints, Layouts, values_at
-from agv_analysis.bags.prefault import PagesAhead
+from agv_analysis.bags.prefault import Prefault
 from agv_analysis.bags.schema import STRING, Struct
 
 _MISFITS_BELIEVED = 100
@@ -91,14 +91,14 @@ class Table:
         self._dtype = self._make_dtype()
         self._store = np.empty(0, np.uint8)
         self._helper = helper
-        self._pages = PagesAhead(self._store, helper)
+        self._prefault = Prefault(self._store, helper)
         self._capacity = 0
         self._count = 0
         self._message_bytes = 0
         self.layouts = Layouts(kind)
         self._place = compiled_place() if helper is not None and not self._ragged else None
         self._recipes = recipes([])
-        self._express: dict[tuple[int, int], tuple[int, Layout]] = {}
+        self._known_layouts: dict[tuple[int, int], tuple[int, Layout]] = {}
         self._clock = np.array([-1, 0], np.int64)
 
     @property
@@ -159,19 +159,19 @@ class Table:
             self._look(new)
 
     def _learn(self, groups: list[Group]) -> None:
-        """Let the fast lane know the layouts of these groups; it is closed if they are not for it, or too many."""
+        """Teach the compiled decoder the layouts of these groups; without success if it cannot copy them all."""
         for group in groups:
             size = group.messages.shape[1]
-            self._express[size, id(group.layout)] = (size, group.layout)
-        plans = [self._plan(layout) for _, layout in self._express.values()]
+            self._known_layouts[size, id(group.layout)] = (size, group.layout)
+        plans = [self._plan(layout) for _, layout in self._known_layouts.values()]
         if any(leaves for _, leaves in plans) or len(plans) > MAX_LAYOUTS:
             self._place = None
             return
-        known = zip(self._express.values(), plans, strict=True)
+        known = zip(self._known_layouts.values(), plans, strict=True)
         self._recipes = recipes([(size, layout, runs) for (size, layout), (runs, _) in known])
 
     def _look(self, new: NDArray[np.void]) -> None:
-        """Look at the times of rows that have not come by the fast lane."""
+        """Check the times of rows that the compiled decoder has not copied."""
         if new[LOG_TIME][0] <= self._clock[0] or check_times("", new).texts():
             self._clock[1] += 1
         self._clock[0] = new[LOG_TIME][-1]
@@ -201,7 +201,7 @@ class Table:
         """Make room for so many more rows."""
         if self._count + number > self._capacity:
             self._move(self._dtype, self._count + number, max(2 * self._capacity, self._expected))
-        self._pages.reach((self._count + number) * self._dtype.itemsize)
+        self._prefault.reach((self._count + number) * self._dtype.itemsize)
 
     def _move(self, dtype: np.dtype[np.void], rows: int, room: int) -> None:
         """Move the rows to a new store for `rows` rows, or for `room` if that is more and not too much."""
@@ -214,7 +214,7 @@ class Table:
         old = self.rows
         self._capacity = max(rows, min(room, _MAX_ROOM // dtype.itemsize))
         self._store = np.zeros(self._capacity * dtype.itemsize, np.uint8)  # what pads a row is zero, too
-        self._pages = PagesAhead(self._store, self._helper)
+        self._prefault = Prefault(self._store, self._helper)
         self._dtype = dtype
         new = self.rows
         if old.dtype == dtype:
@@ -227,11 +227,11 @@ class Table:
 
     def _blank(self) -> NDArray[np.void]:
         """A row without any value: NaN, zero, empty."""
-        empty_trace = np.zeros((), self._dtype)
+        blank = np.zeros((), self._dtype)
         for name in self._dtype.names or ():
             if self._dtype[name].base.kind == "f":
-                empty_trace[name] = np.nan
-        return empty_trace
+                blank[name] = np.nan
+        return blank
 
     # -- values ------------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""New memory in time: its pages are asked for on another thread, before they are written to.
+"""Memory that is ready in time: its pages are requested on another thread, before they are written to.
 
 The kernel gives memory page by page at the first write, and clears each; of a large bag that takes as long as all the
 copying into it, and the writer waits. Where the kernel does not know the request (Linux before 5.14), that stays so.
@@ -20,8 +20,8 @@ _MADV_POPULATE_WRITE = 23
 """In <linux/mman.h>: makes pages as a write would, and leaves alone what is in those that are there."""
 
 
-class PagesAhead:
-    """The pages of an array that is written from its beginning to its end."""
+class Prefault:
+    """Makes the pages of an array that is written from its beginning to its end, ahead of the writing."""
 
     def __init__(self, array: Bytes, helper: Executor | None) -> None:
         """`helper` is where the kernel is waited for; without one nothing is asked for ahead."""

@@ -80,8 +80,8 @@ def command(
 
     with step_bar(sweep.size * seeds, "simulating") as progress:
         rows, complete = collect(sweep, store, results, progress)
-    _report(sweep, rows, metrics, out, suffix)
-    _pages(sweep, rows, report, figures)
+    _write_rows(sweep, rows, metrics, out, suffix)
+    _write_reports(sweep, rows, report, figures)
     if not complete:
         again = ": the same command with --resume goes on" if out is not None else ""
         click.echo(
@@ -90,7 +90,9 @@ def command(
         raise click.exceptions.Exit(130)
 
 
-def _report(sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], out: Path | None, suffix: str) -> None:
+def _write_rows(
+    sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], out: Path | None, suffix: str
+) -> None:
     from agv_analysis.sweep.picture import can_draw, draw
     from agv_analysis.sweep.rows_file import write_rows
 
@@ -106,7 +108,7 @@ def _report(sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], 
         click.echo(f"picture: {out / f'{metric}.png'}")
 
 
-def _pages(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None, figures: Path | None) -> None:
+def _write_reports(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None, figures: Path | None) -> None:
     """Write what `with_report` asks for."""
     if report is not None:
         from agv_analysis.report.sweep_page import write_sweep_report

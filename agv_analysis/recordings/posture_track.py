@@ -87,8 +87,8 @@ def yaws_of(messages: NDArray[np.void], path: str) -> Floats:
     """Yaw [rad] in (-pi, pi]; NaN where the quaternion is zero and says nothing. Shape as that of the components."""
     components = [messages[f"{path}.orientation.{axis}"] for axis in "xyzw"]
     yaws = [yaw_of_quaternion(*q) for q in zip(*(part.ravel().tolist() for part in components), strict=True)]
-    said = np.any(components, axis=0)
-    return np.where(said, np.reshape(yaws, said.shape), np.nan)
+    has_orientation = np.any(components, axis=0)
+    return np.where(has_orientation, np.reshape(yaws, has_orientation.shape), np.nan)
 
 
 def in_order(track: Track, where: str, topic: str) -> Track:

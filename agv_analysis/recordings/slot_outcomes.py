@@ -31,8 +31,8 @@ def slot_outcomes(slots: OnSteps, k: Steps, grid: Grid) -> tuple[Steps, NDArray[
 
 def reasons(notes: NDArray[np.bytes_]) -> LinkSlots:
     """What the notes of slots say, shape (N,). Those of older recordings are empty."""
-    said, of = np.unique(notes, return_inverse=True)
-    facts = [facts_in(note.decode("utf-8", "replace")) for note in said.tolist()]
+    distinct, of = np.unique(notes, return_inverse=True)
+    facts = [facts_in(note.decode("utf-8", "replace")) for note in distinct.tolist()]
     return LinkSlots(
         cause=np.array([fact.get("cause", "") for fact in facts], dtype=np.str_)[of],
         state=np.array([_number(fact, "state", 0.0) for fact in facts], dtype=np.int64)[of],

@@ -103,8 +103,8 @@ def _why(slots: Slots) -> dict[str, Any]:
 
     plotly.js takes some tags and `%{` in a text for its own, so none is left in a cause, which is another's word.
     """
-    said, of = np.unique(slots.cause, return_inverse=True)
-    causes = [html.escape(cause[:_LONGEST_CAUSE]).replace("%", "&#37;") or "not recorded" for cause in said.tolist()]
+    names, of = np.unique(slots.cause, return_inverse=True)
+    causes = [html.escape(cause[:_LONGEST_CAUSE]).replace("%", "&#37;") or "not recorded" for cause in names.tolist()]
     place = "step %{customdata}, (%{x:.3f}, %{y:.3f}) m<br>cause: "
     steps = {"customdata": _binary(slots.k.astype("<f8"), "f8")}
     if len(causes) == 1:

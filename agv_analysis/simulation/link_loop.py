@@ -25,20 +25,20 @@ from agv_analysis.simulation.loop import (
     RunInputs,
     Settings,
     Statistics,
-    apart,
     are_finite,
     begin,
+    compared_reference,
+    driven_command,
     edge_step,
     end,
     goes_on,
-    outdated,
     plant_step,
-    played,
+    pose_distance,
     reference_at,
-    seen_reference,
     sent_pose,
     update_metrics,
-    wheels,
+    wheel_noise,
+    without_pose,
 )
 from agv_cloud.staleness.estimate import staleness_policy
 from agv_plant.channels.position_dependent import EVERYWHERE, outcome_at
@@ -136,16 +136,16 @@ def slot_over_links(
     `past` is known up to the pose of step k; command and error of step k are written into it.
     """
     settings = inputs.settings
-    seen = seen_reference(reference_at(reference, k), reference, k, settings.ahead)
+    compared = compared_reference(reference_at(reference, k), reference, k, settings.ahead)
     edge = at_the_edge(loop.edge, k, taken, reference, past, settings)
-    sent, memory = edge_step(edge, seen, settings)
+    sent, memory = edge_step(edge, compared, settings)
     row = past.values[k]
     row[3], row[4], row[5], row[6], row[7] = sent.v, sent.w, sent.x_e, sent.y_e, sent.theta_e
     store_memory(past.memory[k], memory)
-    n_left, n_right = wheels(inputs.slip, k)
+    n_left, n_right = wheel_noise(inputs.slip, k)
     held = Loop(loop.motion, edge, loop.command, loop.plan)
     if ordered == k:
-        return plant_step(held, sent, memory, False, n_left, n_right, seen, settings), sent
+        return plant_step(held, sent, memory, False, n_left, n_right, compared, settings), sent
     v, w = past.values[ordered, 3], past.values[ordered, 4]
     if are_finite(v, w, 0.0):  # else the plant has refused it, and goes on with the one before
         is_news = ordered != k - 1 - loop.command.n_dl
@@ -154,7 +154,7 @@ def slot_over_links(
         if is_news:
             plan = planned(loop, ordered, k, reference, past, settings.plan_arc, settings)
         held = Loop(loop.motion, edge, command, plan)
-    return plant_step(held, sent, memory, True, n_left, n_right, seen, settings), sent
+    return plant_step(held, sent, memory, True, n_left, n_right, compared, settings), sent
 
 
 def planned(
@@ -168,9 +168,9 @@ def planned(
     memory = recall_memory(past.memory[ordered])
     at_step = loop
     for step in range(ordered, k):
-        seen = seen_reference(reference_at(reference, step), reference, step, settings.ahead)
+        compared = compared_reference(reference_at(reference, step), reference, step, settings.ahead)
         command = HeldCommand(sent.v, sent.w, step - ordered)
-        _, _, plan = played(at_step, sent, memory, command, seen, plan_arc, settings)
+        _, _, plan = driven_command(at_step, sent, memory, command, compared, plan_arc, settings)
         at_step = Loop(loop.motion, loop.edge, loop.command, plan)
     return at_step.plan
 
@@ -187,18 +187,19 @@ def store_memory(row: NDArray[np.float64], memory: Numbers) -> None:
 def at_the_edge(edge: EdgeState, k: int, taken: int, reference: Rows, past: Past, settings: Settings) -> EdgeState:
     """The edge holds the pose of step `taken`; if that is news, its policy takes it on as far as step k."""
     if taken == k - 1 - edge.n_ul:
-        return outdated(edge, seen_reference(reference_at(reference, k), reference, k, settings.ahead), settings)
+        compared = compared_reference(reference_at(reference, k), reference, k, settings.ahead)
+        return without_pose(edge, compared, settings)
     row = past.values[taken]
-    then = seen_reference(reference_at(reference, taken), reference, taken, settings.ahead)
+    then = compared_reference(reference_at(reference, taken), reference, taken, settings.ahead)
     held, target = Pose(row[0], row[1], row[2]), Pose(then.x, then.y, then.theta)
     v, w = edge.v, edge.w
     first = taken if settings.is_stepwise else max(taken, k - 1)
     for step in range(first, k):
         if are_finite(past.values[step, 3], past.values[step, 4], 0.0):
             v, w = past.values[step, 3], past.values[step, 4]
-        seen = seen_reference(reference_at(reference, step + 1), reference, step + 1, settings.ahead)
+        compared = compared_reference(reference_at(reference, step + 1), reference, step + 1, settings.ahead)
         held, target = staleness_policy(
-            settings.policy, held, target, seen, v, w, settings.ts, settings.model_arc, settings.policy_parameters
+            settings.policy, held, target, compared, v, w, settings.ts, settings.model_arc, settings.policy_parameters
         )
     return EdgeState(held, target, k - taken, edge.v, edge.w, edge.memory)
 
@@ -257,8 +258,9 @@ def contraction_over_links(
     for k in range(steps):
         send_pose(past, k, one, inputs.noise, inputs.settings)
         send_pose(past_of_twin, k, other, inputs.noise, inputs.settings)
-        one, sent = slot_over_links(one, k, up_trace.held[k], down_trace.held[k], reference, inputs, past)
-        other, said = slot_over_links(other, k, up_trace.held[k], down_trace.held[k], reference, inputs, past_of_twin)
-        if not (goes_on(one, sent) and goes_on(other, said)):
+        taken, ordered = up_trace.held[k], down_trace.held[k]
+        one, sent = slot_over_links(one, k, taken, ordered, reference, inputs, past)
+        other, sent_by_twin = slot_over_links(other, k, taken, ordered, reference, inputs, past_of_twin)
+        if not (goes_on(one, sent) and goes_on(other, sent_by_twin)):
             return math.inf
-    return apart(one.motion, other.motion) / apart(inputs.start.motion, twin.motion)
+    return pose_distance(one.motion, other.motion) / pose_distance(inputs.start.motion, twin.motion)

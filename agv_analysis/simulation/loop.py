@@ -150,16 +150,16 @@ def at_rest(x: float, y: float, theta: float, states: Numbers = (), memory: Numb
 
 def slot(loop: Loop, reference: ReferencePoint, inputs: RunInputs, k: int) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, under the outcomes of both links in slot k, with the reference as the edge sees it."""
-    n_left, n_right = wheels(inputs.slip, k)
+    n_left, n_right = wheel_noise(inputs.slip, k)
     if inputs.lost[k]:
-        edge = outdated(loop.edge, reference, inputs.settings)
+        edge = without_pose(loop.edge, reference, inputs.settings)
         sent, memory = edge_step(edge, reference, inputs.settings)
         held = Loop(loop.motion, edge, loop.command, loop.plan)
         return plant_step(
             held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings
         ), sent  # fmt: skip
     # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
-    edge = received(loop.edge, sent_pose(loop.motion, inputs.noise, k, inputs.settings), reference)
+    edge = with_pose(loop.edge, sent_pose(loop.motion, inputs.noise, k, inputs.settings), reference)
     sent, memory = edge_step(edge, reference, inputs.settings)
     held = Loop(loop.motion, edge, loop.command, loop.plan)
     return plant_step(held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings), sent
@@ -171,7 +171,7 @@ def reference_at(reference: Rows, k: int) -> ReferencePoint:
     return ReferencePoint(x, y, theta, v, w)
 
 
-def seen_reference(now: ReferencePoint, reference: Rows, k: int, ahead: int | None) -> ReferencePoint:
+def compared_reference(now: ReferencePoint, reference: Rows, k: int, ahead: int | None) -> ReferencePoint:
     """The reference that the edge compares with at step k: that of now, or the one that it looks ahead to."""
     if ahead is None:
         return now
@@ -189,14 +189,14 @@ def sent_pose(motion: Motion, noise: Rows | None, k: int, settings: Settings) ->
     return Pose(x, y, theta)
 
 
-def wheels(slip: Rows | None, k: int) -> tuple[float, float]:
+def wheel_noise(slip: Rows | None, k: int) -> tuple[float, float]:
     """Normal numbers of the left and the right wheel in slot k."""
     if slip is None:
         return 0.0, 0.0
     return slip[k][0], slip[k][1]
 
 
-def outdated(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> EdgeState:
+def without_pose(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> EdgeState:
     """No pose has come: what the edge holds is one step older, and its policy says what to make of it."""
     held, target = staleness_policy(
         settings.policy, edge.held, edge.target, reference, edge.v, edge.w, settings.ts, settings.model_arc,
@@ -205,7 +205,7 @@ def outdated(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> 
     return EdgeState(held, target, edge.n_ul + 1, edge.v, edge.w, edge.memory)
 
 
-def received(edge: EdgeState, pose: Pose, reference: ReferencePoint) -> EdgeState:
+def with_pose(edge: EdgeState, pose: Pose, reference: ReferencePoint) -> EdgeState:
     """The edge holds the pose of now."""
     return EdgeState(pose, Pose(reference.x, reference.y, reference.theta), 0, edge.v, edge.w, edge.memory)
 
@@ -241,11 +241,11 @@ def plant_step(
         edge = EdgeState(edge.held, edge.target, edge.n_ul, sent.v, sent.w, memory)
     if lost or not is_finite:
         held = HeldCommand(loop.command.v, loop.command.w, loop.command.n_dl + 1)
-    v, w, plan = played(loop, sent, memory, held, reference, settings.plan_arc, settings)
+    v, w, plan = driven_command(loop, sent, memory, held, reference, settings.plan_arc, settings)
     return Loop(period(loop.motion, v, w, held.n_dl, n_left, n_right, settings.vehicle, settings), edge, held, plan)
 
 
-def played(
+def driven_command(
     loop: Loop, sent: EdgeOutput, memory: Numbers, held: HeldCommand, reference: ReferencePoint,
     plan_arc: bool | None, settings: Settings,
 ) -> tuple[float, float, PlanState]:  # fmt: skip
@@ -300,7 +300,7 @@ def history(reference: Rows, inputs: RunInputs, rows: NDArray[np.float64], n_ul:
     for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
         rows[k, 0], rows[k, 1], rows[k, 2] = loop.motion.x, loop.motion.y, loop.motion.theta
-        loop, sent = slot(loop, seen_reference(now, reference, k, inputs.settings.ahead), inputs, k)
+        loop, sent = slot(loop, compared_reference(now, reference, k, inputs.settings.ahead), inputs, k)
         rows[k, 3], rows[k, 4], rows[k, 5] = sent.x_e, sent.y_e, sent.theta_e
         rows[k, 6], rows[k, 7] = sent.v, sent.w
         n_ul[k] = loop.edge.n_ul
@@ -360,10 +360,10 @@ def begin(reference: Rows, inputs: RunInputs) -> MetricsAccumulator:
 
 
 def proceed(
-    run: MetricsAccumulator, k: int, now: ReferencePoint, seen: ReferencePoint, inputs: RunInputs
+    run: MetricsAccumulator, k: int, now: ReferencePoint, compared: ReferencePoint, inputs: RunInputs
 ) -> MetricsAccumulator:
-    """The run after slot k, at which the reference is at `now`, and the edge compares with `seen`."""
-    loop, sent = slot(run.loop, seen, inputs, k)
+    """The run after slot k, at which the reference is at `now`, and the edge compares with `compared`."""
+    loop, sent = slot(run.loop, compared, inputs, k)
     return update_metrics(run, k, now, loop, sent)
 
 
@@ -417,7 +417,7 @@ def statistics(reference: Rows, inputs: RunInputs) -> Statistics:
     run = begin(reference, inputs)
     for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
-        run = proceed(run, k, now, seen_reference(now, reference, k, inputs.settings.ahead), inputs)
+        run = proceed(run, k, now, compared_reference(now, reference, k, inputs.settings.ahead), inputs)
         if not run.goes_on:
             break
     return end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
@@ -432,9 +432,9 @@ def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tupl
     for k in range(len(one.lost)):
         now = reference_at(reference, k)
         if first.goes_on:
-            first = proceed(first, k, now, seen_reference(now, reference, k, one.settings.ahead), one)
+            first = proceed(first, k, now, compared_reference(now, reference, k, one.settings.ahead), one)
         if second.goes_on:
-            second = proceed(second, k, now, seen_reference(now, reference, k, other.settings.ahead), other)
+            second = proceed(second, k, now, compared_reference(now, reference, k, other.settings.ahead), other)
     y_r = reference[0][1]
     return (
         end(first, y_r - one.start.motion.y, one.settings.ts),
@@ -451,19 +451,19 @@ def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple
     run, begun, ends = begin(reference, inputs), twin, False
     for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
-        seen = seen_reference(now, reference, k, inputs.settings.ahead)
-        run = proceed(run, k, now, seen, inputs)
+        compared = compared_reference(now, reference, k, inputs.settings.ahead)
+        run = proceed(run, k, now, compared, inputs)
         if not ends:
-            twin, sent = slot(twin, seen, inputs, k)
+            twin, sent = slot(twin, compared, inputs, k)
             ends = not goes_on(twin, sent)
         if not run.goes_on:
             break
     found = end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
     if ends or not run.goes_on:
         return found, math.inf
-    return found, apart(run.loop.motion, twin.motion) / apart(inputs.start.motion, begun.motion)
+    return found, pose_distance(run.loop.motion, twin.motion) / pose_distance(inputs.start.motion, begun.motion)
 
 
-def apart(one: Motion, other: Motion) -> float:
+def pose_distance(one: Motion, other: Motion) -> float:
     """Distance of two AGVs in (x, y, theta) [m, m, rad], a radian counting as a metre."""
     return math.hypot(math.hypot(one.x - other.x, one.y - other.y), one.theta - other.theta)

@@ -33,17 +33,17 @@ def next_error(
 
 def planned_commands(
     error: tuple[float, float, float], speeds: Iterable[tuple[float, float]], memory: Memory, gains: Gains, ts: float,
-    look_ahead: float, v_max: float, arc: bool, answer: Any = command,
+    look_ahead: float, v_max: float, arc: bool, law_command: Any = command,
 ) -> tuple[list[tuple[float, float]], Memory]:  # fmt: skip
     """Commands (v, w) from now on, one for each of the reference's `speeds` (v_r, w_r), the first for `error`.
 
-    `answer` is `command` with the chosen law in it. Beside them the law's memory after the first of them, for the next
-    step.
+    `law_command` is `command` with the chosen law in it. Also returns the law's memory after the first command, for the
+    next step.
     """
     commands: list[tuple[float, float]] = []
     after_first = ahead = memory
     for v_r, w_r in speeds:
-        v, w, ahead = answer(*error, v_r, w_r, ahead, gains, ts, look_ahead, v_max)
+        v, w, ahead = law_command(*error, v_r, w_r, ahead, gains, ts, look_ahead, v_max)
         after_first = after_first if commands else ahead
         commands.append((v, w))
         error = next_error(*error, v, w, v_r, w_r, ts, arc)

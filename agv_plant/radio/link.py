@@ -71,8 +71,8 @@ class Link:
         is_again, self._sent_ns = stamp_ns == self._sent_ns, stamp_ns
         if is_again and not arrived:
             arrived = [*self._freshest]
-        said = LOST if outcome.lost else DELAYED if wait else DELIVERED
-        return Passage(Slot(stamp_ns, self._freshest_ns, said, self._note(outcome, wait)), arrived)
+        word = LOST if outcome.lost else DELAYED if wait else DELIVERED
+        return Passage(Slot(stamp_ns, self._freshest_ns, word, self._note(outcome, wait)), arrived)
 
     def _send(self, k: int, stamp_ns: int, message: bytes) -> int:
         """Put a message, and its copy if there is one, under way; returns the slots until the first of them arrives."""

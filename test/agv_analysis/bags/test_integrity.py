@@ -712,7 +712,7 @@ def _mutations() -> st.SearchStrategy[bytes]:
 
 @given(_contents())
 @settings(max_examples=300, deadline=None, derandomize=True)
-def test_the_compiled_survey_is_the_walk_from_record_to_record(content: bytes) -> None:
+def test_the_compiled_index_is_the_walk_from_record_to_record(content: bytes) -> None:
     """Or leaves it to that, where there is anything else than messages."""
     found, is_named = sort_out(content, [], is_large=True)
     expected = walk(content)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from agv_analysis.bags.message_batch import Bytes
-from agv_analysis.bags.prefault import PagesAhead
+from agv_analysis.bags.prefault import Prefault
 
 MIB = 2**20
 
@@ -44,7 +44,7 @@ def test_pages_are_there_before_they_are_written_to() -> None:
     array = np.zeros(256 * MIB, np.uint8)
     before = resident(array)
     with ThreadPoolExecutor(1) as helper:
-        PagesAhead(array, helper).reach(32 * MIB)
+        Prefault(array, helper).reach(32 * MIB)
     found = (resident(array) - before) / MIB
     assert 40 <= found <= 72  # not much more than asked for: others need memory, too
 
@@ -52,7 +52,7 @@ def test_pages_are_there_before_they_are_written_to() -> None:
 def test_what_is_written_meanwhile_stays_and_the_rest_is_zero() -> None:
     array = np.zeros(64 * MIB + 5, np.uint8)
     with ThreadPoolExecutor(1) as helper:
-        pages = PagesAhead(array, helper)
+        pages = Prefault(array, helper)
         for begin in range(0, len(array), MIB):
             pages.reach(begin + MIB)
             array[begin : begin + MIB : 1000] = 7
@@ -66,5 +66,5 @@ def test_an_array_of_less_than_a_page_and_an_empty_one_need_nothing() -> None:
     with ThreadPoolExecutor(1) as helper:
         for size in (0, 1, 4095):
             array = np.zeros(size, np.uint8)
-            PagesAhead(array, helper).reach(size)
+            Prefault(array, helper).reach(size)
             assert not array.any()
