@@ -49,7 +49,7 @@ class Run:
     downlink_lost: NDArray[np.bool_]
     """Outcome of the downlink on slot k, shape (N,)."""
     n_dl: NDArray[np.int64] | None = None
-    """Steps since the freshest command that the AGV holds was sent, shape (N,); None if nobody has written it down."""
+    """Steps since the freshest command that the AGV holds was sent, shape (N,); None if it is not recorded."""
     uplink: LinkSlots | None = None
     """What is known of the uplink's slots beside their outcomes; None if nothing is."""
     downlink: LinkSlots | None = None

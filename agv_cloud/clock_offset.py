@@ -1,6 +1,6 @@
 """The freshest pose at an edge that steps by its own clock, and what that clock says in the AGV's time.
 
-Theory of operation. Behind a real radio nobody announces a lost slot, and two hosts have two clocks. The edge therefore
+Theory of operation. Behind a real radio lost slots are not announced, and two hosts have two clocks. The edge therefore
 steps by its own clock, in the time that the AGV's stamps are made of. Own time minus stamp is the clocks' offset plus
 the time that a pose was under way; the least of the last while is taken for the offset, so that the edge is late by the
 least delay and never ahead. It is forgotten after 10 to 20 s, since one clock may run slower than the other.

@@ -1,4 +1,4 @@
-"""How punctual a periodic loop is: jitter of its period and missed deadlines."""
+"""Timing of a periodic loop: jitter of its period and missed deadlines."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ class PlantNode(LoopNode[PlantParameters]):
             self.fail(f"{VEHICLES.find(plant.vehicle).where} {complaint(problem)}, at step {self.k}")
             return
         if not all(map(math.isfinite, motion[:3])):
-            self.fail(f"the loop diverged: after step {self.k} the pose {self.state} leaves the range of numbers")
+            self.fail(f"the loop diverged: after step {self.k} the pose {self.state} is no longer finite")
             return
         self._motion = motion
         self.k += 1
@@ -228,7 +228,7 @@ class PlantNode(LoopNode[PlantParameters]):
         )
 
     def _may_be_lost(self, known: frozenset[tuple[str, bytes]]) -> bool:
-        """May the pose of this step have come before a peer was up, be it at the start or started again?"""
+        """Was the pose of this step possibly sent before a peer was up, at the start or after a restart?"""
         peers = self._peers()
         return self.k == 0 or (peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 

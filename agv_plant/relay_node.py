@@ -1,6 +1,6 @@
 """The radio link: the only way between the AGV and the edge.
 
-With a DDS domain for each of them it is so by construction, and the relay looks that nobody builds another way.
+With a DDS domain for each of them that holds by construction, and the relay checks that nothing bypasses it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LOOK_PERIOD = 1.0
 
 
 class RelayNode(LoopNode[RelayParameters]):
-    """Forwards, delays or loses each message as it is, and says which in the slot."""
+    """Forwards, delays or loses each message unchanged, and reports the outcome in the slot."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("relay", RelayParameters, **node_options)

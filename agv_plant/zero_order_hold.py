@@ -1,4 +1,4 @@
-"""The command that the AGV obeys in real time: the newest one, until it is too old."""
+"""The command that drives the AGV in real time: the newest one, until it is too old."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from agv_ros.messages import Command
 class ZeroOrderHold:
     """Zero-order hold with a limit on age.
 
-    `outdated` counts commands that are not obeyed for their stamp: they came after a newer one, or are from the future
-    and would be obeyed until it is past; and those that came a second time. `stops` counts how often the AGV was
-    stopped for want of a command.
+    `outdated` counts commands that are ignored: they came after a newer one, carry a stamp from the future and would
+    hold until then, or came a second time. `stops` counts how often the AGV was stopped because it had no command.
     """
 
     def __init__(self, timeout_ns: int) -> None:
@@ -22,7 +21,7 @@ class ZeroOrderHold:
         self.stops = 0
 
     def offer(self, command: Command) -> None:
-        """Take a command; one that is older than the newest, or newer than the last instant, is not obeyed."""
+        """Take a command; one that is older than the newest, or newer than the last instant, is ignored."""
         is_early = self._now_ns is not None and command.stamp_ns > self._now_ns
         is_late = self._newest is not None and command.stamp_ns < self._newest.stamp_ns
         if is_early or is_late or command == self._newest:
@@ -31,7 +30,7 @@ class ZeroOrderHold:
         self._newest = command
 
     def at(self, stamp_ns: int) -> Command:
-        """The command to obey at an instant: standing still before the first and beyond the limit on age."""
+        """The command that holds at an instant: zero before the first and beyond the limit on age."""
         self._now_ns = stamp_ns
         newest = self._newest
         if newest is not None and newest.stamp_ns > stamp_ns:  # offered before the first instant was known

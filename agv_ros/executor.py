@@ -27,7 +27,7 @@ SPIN_TIMEOUT = 0.05
 """Longest wait [s] for the next event. Unbounded, the events executor neither runs timers nor sees signals."""
 
 LAST_FLUSH_TIMEOUT = 10.0
-"""How long [s] a node that ends of itself, with nobody waiting for it, waits for subscribers that lag."""
+"""How long [s] a node that finishes normally waits for subscribers that lag."""
 
 
 class Stop:

@@ -132,7 +132,7 @@ class MessageSync(Generic[M]):
             self._held = message
         self._settled_ns = slot.freshest_ns
         later = {ns: message for ns, message in self._arrived.items() if ns > slot.freshest_ns}
-        self.outdated += len(self._arrived) - len(later)  # overtaken, before anybody asked for them
+        self.outdated += len(self._arrived) - len(later)  # overtaken before they were needed
         self._arrived = later
         self._last_slot_ns = slot.stamp_ns
         return Joined(slot, self._held)

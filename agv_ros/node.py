@@ -223,7 +223,7 @@ class LoopNode(Node, Generic[P]):
     # -- diagnostics -------------------------------------------------------------------------------------------------
 
     def facts(self) -> dict[str, str]:
-        """What this node has to say of itself in its diagnostics, beside what it rejected."""
+        """What this node reports in its diagnostics, beside what it rejected."""
         return {}
 
     def report_every_second(self, stamp_ns: int) -> None:

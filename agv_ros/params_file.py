@@ -137,7 +137,7 @@ def resolve(
 
 
 def _from_file(node: str, schema: type, sections: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """A node's values, checked. As in ROS, a later section wins, be it the node's or that of all nodes."""
+    """A node's values, checked. As in ROS, a later section wins, whether it is the node's or that of all nodes."""
     known = parameters_of(schema)
     merged: dict[str, Any] = {}
     for title, section in sections.items():

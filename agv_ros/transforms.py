@@ -1,4 +1,4 @@
-"""Where the loop's frames are, on /tf: for RViz and for whoever asks tf2, and no part of the loop.
+"""Where the loop's frames are, on /tf: for RViz and other users of tf2; not part of the loop.
 
 tf2_msgs belongs to ROS and is in no wheel, so it may be absent; then nothing is sent.
 """
@@ -22,7 +22,7 @@ _DEPTH = 100
 
 
 class TransformBroadcaster:
-    """Sends the pose of one frame in frame `map`, as long as somebody listens."""
+    """Sends the pose of one frame in frame `map`, as long as there is a subscriber."""
 
     def __init__(self, node: LoopNode[Any], frame: str) -> None:
         self._frame = node.settings.frame_prefix + frame

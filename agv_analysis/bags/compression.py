@@ -11,7 +11,7 @@ MAX_CHUNK = 2**30
 """Most bytes that one chunk may inflate to: a thousand times what ROS 2 writes."""
 
 _PIECE = 2**22
-"""So many bytes are inflated at a time where nobody can say how many there are."""
+"""Bytes that are inflated at a time where the total is unknown."""
 
 NAMES = ("", "zstd", "lz4")
 """Compressions of the MCAP registry."""

@@ -49,7 +49,7 @@ class Findings:
         """One line for each kind, and one for all that no CRC covers."""
         found = tuple(_text(what, kind) for what, kind in self._kinds.items())
         unchecked = ", ".join(f"{what}: {count}" for what, count in self._unchecked.items())
-        return (*found, f"not checked, for want of a CRC: {unchecked}") if unchecked else found
+        return (*found, f"not checked, because there is no CRC: {unchecked}") if unchecked else found
 
 
 def _text(what: str, kind: _Kind) -> str:

@@ -64,7 +64,7 @@ def new_directory(directory: Path) -> Iterator[None]:
 class BagWriter:
     """An open bag. `describe` is asked for a topic, by its number, once there are some messages, or at the end.
 
-    A topic that nobody offers is in the bag only once it has a message.
+    A topic without a publisher is in the bag only once it has a message.
     """
 
     def __init__(

@@ -71,7 +71,7 @@ def command(
     scenario = with_settings(run.scenario, settings)
     if scenario.error_detector.track == PATH and (again or (on_dds and edge == "own")):
         raise UserError(
-            f"{bag}: its reference came as paths, which are not in it, so its edge and its run are not had again; "
+            f"{bag}: its reference came as paths, which are not in it, so its edge and its run cannot be rerun; "
             "--compare alone goes by the recorded reference"
         )
     if again:

@@ -1,4 +1,4 @@
-"""What takes longer than a move may: the criteria for the whole lap and for the very losses of the run."""
+"""What takes too long for a move of a slider: the criteria over the whole lap, and for the loss sequence of the run."""
 
 from __future__ import annotations
 
@@ -42,11 +42,17 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
         analysis = analyse(simulate(scenario))
         found = [("Verdict", sentence(analysis))]
         if analysis.floquet is not None:
-            said = "stable" if analysis.floquet < 1.0 else "unstable"
-            found.append(("These very losses", f"{said}, an error grows by a factor {analysis.floquet:.6g} a step"))
+            found.append(("This loss sequence (Floquet)", _growth(analysis.floquet)))
         return found + list(margin_rows(scenario))
     except UserError:
         return []
+
+
+def _growth(factor: float) -> str:
+    """Whether errors that grow by a factor a step die out, in words."""
+    if factor < 1.0:
+        return f"stable: errors shrink by {100.0 * (1.0 - factor):.2g} % per step"
+    return f"unstable: errors grow by {100.0 * (factor - 1.0):.2g} % per step"
 
 
 class LatestOnlyWorker(Generic[R]):

@@ -122,7 +122,7 @@ def _refused(line: str) -> NetemError:
 
 
 def _exact(value: float) -> Decimal:
-    """The shortest decimal number that reads as `value`: what somebody wrote."""
+    """The shortest decimal number that reads as `value`: as a person would write it."""
     return Decimal(repr(value))
 
 

@@ -51,7 +51,7 @@ class ErrorMetrics:
     iae: float
     """Integral of |e| over time, [m s]: T_s sum |e(k)|."""
     ise: float
-    """Integral of e^2 over time, [m^2 s]; inf where it leaves the range of numbers."""
+    """Integral of e^2 over time, [m^2 s]; inf where it overflows."""
 
 
 @dataclass(frozen=True)

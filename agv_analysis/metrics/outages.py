@@ -89,7 +89,7 @@ def outages(run: Run) -> Outages:
     """Outages of a run. Raises UserError if the run has no step.
 
     The ages are those that the slots say; that of the downlink follows from its outcomes where it is not recorded.
-    Where steps are missing from a recording an outage ends: nobody knows what became of those slots.
+    Where steps are missing from a recording an outage ends, since the outcomes of those slots are unknown.
     """
     if not len(run):
         raise UserError(f"{run.source}: no step of the loop in it, so no outage: record at least one")

@@ -36,7 +36,7 @@ class Slots(NamedTuple):
 
     k: NDArray[np.int64]
     cause: NDArray[np.str_]
-    """Empty where nobody has written it down."""
+    """Empty where it is not recorded."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _most(values: Floats) -> tuple[float, float] | None:
 
 
 def outage_lengths(analysis: Observations) -> Panel:
-    """How many outages of each length there were, and how many the fitted channel lets expect."""
+    """How many outages of each length there were, and how many are expected under the fit."""
     up, fit = analysis.outages.uplink, analysis.fit
     lengths = np.arange(1, max(1, up.longest) + 1, dtype=np.float64)
     lines = [Line("seen", lengths, np.array([up.histogram.get(int(n), 0) for n in lengths], dtype=float), LOST, BARS)]
@@ -228,7 +228,7 @@ def thinned(line: Line, most: int) -> Line:
 
 
 def to_json(panel: Panel, most: int) -> dict[str, Any]:
-    """A panel's lines by name, for who wants the numbers; null where nothing is drawn."""
+    """A panel's lines by name, for numeric export; null where nothing is drawn."""
     lines = [thinned(line, most) for line in panel.lines]
     return {
         "title": panel.title,

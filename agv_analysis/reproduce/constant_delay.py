@@ -19,8 +19,8 @@ from agv_plant.parameters import ChannelParameters
 def poses(scenario: Scenario, n: int, offset: float = 0.0) -> Floats:
     """X_c(k) of a run whose pose at the edge is always X_c(k - n), of X_c(0) for k < n; shape (steps, 3).
 
-    The AGV starts `offset` [m, m, rad] away from the scenario's initial pose. Fewer rows than steps if the loop left
-    the range of numbers.
+    The AGV starts `offset` [m, m, rad] away from the scenario's initial pose. Fewer rows than steps if a pose
+    is no longer finite.
     """
     late = ChannelParameters(delay=n * scenario.plant.ts)
     x, y, theta = (value + offset for value in scenario.plant.initial_pose)

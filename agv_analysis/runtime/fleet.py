@@ -94,7 +94,7 @@ def _moved(pose: tuple[float, float, float], shift: tuple[float, float]) -> tupl
 
 @dataclass(frozen=True)
 class Vehicle:
-    """How one vehicle of a fleet fared; figures are None if nobody knows them, as without a recording."""
+    """The result of one vehicle of a fleet; figures are None where they are unknown, as without a recording."""
 
     vehicle: str
     steps: int
@@ -110,7 +110,7 @@ class Vehicle:
     verdict: str | None = None
     verdict_criterion: str | None = None
     contraction: float | None = None
-    """Distance at the end of twins that meet its very losses, as a multiple of that at the beginning; see `twins`."""
+    """Distance of twins under its loss sequence at the end, as a multiple of that at the beginning; see `twins`."""
     unstable: bool | None = None
     """Did its twins not come closer to each other, or did it diverge?"""
 
@@ -141,8 +141,8 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
 def twins(run: Run) -> float | None:
     """Distance in (x, y, theta) of two AGVs at the end of a run, as a multiple of that at its beginning.
 
-    They are simulated, begin a micrometre apart and meet the run's losses; inf if one leaves the range of numbers. None
-    if losses depend on the place, or are not those that the run's parameters give.
+    They are simulated, begin a micrometre apart and meet the losses of the run; inf if one diverges. None if the losses
+    depend on the place, or are not those that the run's parameters give.
     """
     one, other = _simulated(run, 0.0), _simulated(run, TWIN_OFFSET)
     if min(len(one), len(other)) < len(run):

@@ -52,7 +52,7 @@ class Pace(NamedTuple):
 
 
 class ReplayRecorder(RecorderNode):
-    """Records what is played and answered, and beside it what the recording holds of the AGV's side of the radio.
+    """Records what is played and answered, and beside it what was recorded on the AGV's side of the radio.
 
     These messages go to the new bag alone, not over DDS, where a real AGV might listen to them.
     """
@@ -97,7 +97,7 @@ class ReplayNode(LoopNode[LoopParameters]):
     """
 
     def __init__(self, inputs: EdgeInputs, pace: Pace, edge_runs: bool = False, **node_options: Any) -> None:
-        """`edge_runs`: the nodes of the edge have been started by somebody else."""
+        """`edge_runs`: the nodes of the edge have been started elsewhere."""
         super().__init__("replay", LoopParameters, **node_options)
         self.k = 0
         """Number of slots played."""

@@ -154,7 +154,7 @@ class Loop(NamedTuple):
 
 
 def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: Progress) -> list[Outcome]:
-    """Run loops until all have done all their steps; `progress` is told of the steps of all of them together."""
+    """Run loops until all have done all their steps; `progress` receives the total of their steps."""
     for loop in loops:
         for node in (*loop.nodes, loop.recorder) if loop.recorder else loop.nodes:
             add(executor, node)

@@ -68,7 +68,7 @@ def simulate_batch(
 
     Seeds are paired: under one seed all scenarios with the same channel meet the same outages, and all AGVs the same
     noise and slip; `relay.seed` and `plant.seed` of the scenarios do not count. `workers` threads, one a core by
-    default, do the work; their number changes nothing in the result. `progress` is told how many runs are done. Raises
+    default, do the work; the result is the same for any number. `progress` receives the number of runs done. Raises
     UserError if a run has no end, PartError if a control law, a vehicle or a policy raises or returns NaN.
     """
     batch, workers, done = _Batch(scenarios, seeds, twins), workers or cores(), 0

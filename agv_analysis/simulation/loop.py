@@ -8,7 +8,7 @@ plain Python and compiled, so it keeps to what numba knows: floats, tuples, arra
 Control law, staleness policy and vehicle are called by placeholders (`control_law`, `staleness_policy`,
 `vehicle_step`), which `parts` replaces by those that a scenario chooses; so a loop is compiled for its own parts.
 
-What a run does not have is None: numba compiles a function anew for it, without the branch that nobody takes. The
+What a run does not have is None: numba compiles a function anew for it, without the branch that is never taken. The
 paper's plant thus costs nothing of what can be had beside it.
 """
 
@@ -60,7 +60,7 @@ class Settings(NamedTuple):
     plan_arc: bool | None
     """The same as `arc`, for the controller's model, if the plant plays its plans."""
     vehicle: VehicleParameters | None
-    """The AGV, if it is not the paper's, which does what it is told."""
+    """The AGV; None for the paper's, which follows its commands exactly."""
     noise_xy: float
     noise_theta: float
 
@@ -213,7 +213,7 @@ def with_pose(edge: EdgeState, pose: Pose, reference: ReferencePoint) -> EdgeSta
 def edge_step(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> tuple[EdgeOutput, Numbers]:
     """The edge's answer, from the pose that it holds, and what the control law remembers after it.
 
-    An error beyond the range of numbers is refused by the controller, as it comes in from the wire.
+    An error that is not finite is refused by the controller, as one from the wire is.
     """
     held, target = edge.held, edge.target
     x_e, y_e, theta_e = tracking_error(target.x, target.y, target.theta, held.x, held.y, held.theta)
@@ -232,8 +232,8 @@ def plant_step(
 ) -> Loop:  # fmt: skip
     """One sampling period of the plant under the freshest command; the edge keeps in mind what it sent.
 
-    n_left and n_right are the wheels' normal numbers; `memory` is the control law's after this step. A command beyond
-    the range of numbers is refused by the plant, which goes on with the one before.
+    n_left and n_right are the wheels' normal numbers; `memory` is the control law's after this step. A command
+    that is not finite is refused by the plant, which continues with the one before.
     """
     edge, held = loop.edge, HeldCommand(sent.v, sent.w, 0)
     is_finite = are_finite(sent.v, sent.w, 0.0)
@@ -277,7 +277,7 @@ def period(
 
 
 def goes_on(loop: Loop, sent: EdgeOutput) -> bool:
-    """Is there a next slot? Not after a pose beyond the range of numbers, nor if the edge sent no command."""
+    """Is there a next slot? Not after a pose that is not finite, nor if the edge sent no command."""
     motion = loop.motion
     return are_finite(motion.x, motion.y, motion.theta) and are_finite(sent.x_e, sent.y_e, sent.theta_e)
 
@@ -316,7 +316,7 @@ class Statistics(NamedTuple):
     """
 
     steps: int
-    """Slots until the run ended: fewer than asked for if the loop left the range of numbers."""
+    """Slots until the run ended: fewer than asked for if the loop diverged."""
     settle_1cm_steps: int
     settle_2pct_steps: int
     overshoot: float
@@ -446,7 +446,7 @@ def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple
     """A run as `statistics`, and how far a twin of it, begun elsewhere and with the same losses, is in the end.
 
     That is the distance of the two AGVs in (x, y, theta) [m, m, rad] as a multiple of what it was at the beginning: a
-    loop that forgets where it began contracts it. inf if either leaves the range of numbers.
+    loop that forgets where it began contracts it. inf if either diverges.
     """
     run, begun, ends = begin(reference, inputs), twin, False
     for k in range(len(inputs.lost)):

@@ -74,7 +74,7 @@ def run_parts(loop: Function, parts: Replacements, *arguments: Any) -> Any:
     if HAS_NUMBA and key not in _NOT_COMPILED:
         try:
             return compiled(loop, parts)(*arguments)
-        except Exception:  # whatever numba, or a part in it, raises; plain Python says which
+        except Exception:  # from numba or from a part in it; plain Python tells which
             found = _run_plain(loop, parts, arguments)
             _NOT_COMPILED.add(key)
             return found

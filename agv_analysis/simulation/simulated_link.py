@@ -16,7 +16,7 @@ from agv_plant.radio.channel import Channel, draws
 
 
 class SimulatedLink:
-    """A channel under one seed, asked by the loop or beforehand, and what became of its messages."""
+    """A channel under one seed, evaluated in the loop or before it, and what became of its messages."""
 
     def __init__(self, channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> None:
         self.lost: Outcomes

@@ -33,8 +33,7 @@ def simulate(scenario: Scenario) -> Run:
     """The run of a scenario in lockstep, as a recording of the nodes would give it.
 
     Raises UserError if the run has no end, TrackFileError for a bad track file, PartError if a control law, a vehicle
-    or a policy raises or returns NaN. A loop that leaves the range of numbers ends there, and its run says so in its
-    notes.
+    or a policy raises or returns NaN. A loop that diverges ends there, and its run says so in its notes.
     """
     steps, relay, plant = steps_of(scenario), scenario.relay, scenario.plant
     reference = reference_of(scenario.error_detector, steps + scenario.controller.steps_ahead).copy()
@@ -72,7 +71,7 @@ def _drive(
 ) -> tuple[Floats, int]:
     """X_c, eps and u of a run's slots, shape (N, 8), and the slots until it ended; fills the traces of the links.
 
-    Where a message that is not lost is there at once, outcomes known beforehand are all that is needed of the radio.
+    Where a message that is not lost arrives in its own slot, outcomes computed in advance replace the radio.
     """
     rows = np.full((len(inputs.lost), 8), math.nan)
     try:
@@ -103,7 +102,7 @@ def steps_of(scenario: Scenario) -> int:
 
 
 def obeys_at_once(plant: PlantParameters) -> bool:
-    """Is the AGV a unicycle that does in each step just what it is told, as the paper's does?"""
+    """Is the AGV a unicycle that follows each command exactly, as the paper's does?"""
     vehicle = vehicle_parameters(plant)
     usual = vehicle._replace(arc=_PAPERS_VEHICLE.arc, ts=_PAPERS_VEHICLE.ts)
     return plant.vehicle == UNICYCLE and usual == _PAPERS_VEHICLE
@@ -131,11 +130,9 @@ def _notes(scenario: Scenario, done: int, steps: int, command: Floats) -> list[s
     notes = []
     refused = np.flatnonzero(np.isinf(command).any(axis=1))
     if len(refused):
-        notes.append(
-            f"{len(refused)} commands were beyond the range of numbers and refused, the first at step {refused[0]}"
-        )
+        notes.append(f"{len(refused)} commands were not finite and were refused, the first at step {refused[0]}")
     if done < steps:
-        notes.append(f"the loop diverged: after step {done - 1} of {steps} the AGV left the range of numbers")
+        notes.append(f"the loop diverged: after step {done - 1} of {steps} the AGV's pose is no longer finite")
     if scenario.plant.clock != "lockstep":
         notes.append(
             f"plant.clock is {scenario.plant.clock}, but a simulation runs in lockstep: no jitter, no time-out"

@@ -21,7 +21,7 @@ def collect(
     """Rows of a sweep, and whether it is complete: on Ctrl-C those of what is done.
 
     `results` gives the parts that it is asked for as they are done, in any order; each is kept in the `store` if there
-    is one, and those that it holds are not asked for again. `progress` is told the number of runs done.
+    is one, and those that it holds are not computed again. `progress` receives the number of runs done.
     """
     table = np.zeros((sweep.size, sweep.seed_count), dtype=STATISTICS)
     done = np.zeros(table.shape, dtype=np.bool_)

@@ -22,7 +22,7 @@ from agv_ros.errors import UserError
 def speeds_of(parameters: ErrorDetectorParameters) -> Callable[[int], Speeds]:
     """Speeds (v_r, w_r) by step of the track that the parameters name.
 
-    Raises TrackFileError for a bad file, UserError for a track that nobody knows beforehand.
+    Raises TrackFileError for a bad file, UserError for a track that is not known in advance.
     """
     ts = parameters.ts
     if parameters.track == PATH:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 _LEAST_CHANGE = 1e-300
-"""Of an acceleration [m/s^2] in a step: something may be divided by it."""
+"""Of an acceleration [m/s^2] in a step: avoids division by zero."""
 
 _MOST_STEPS = 1e9
 """More steps than any braking takes; keeps a square root that is infinite from becoming an integer."""

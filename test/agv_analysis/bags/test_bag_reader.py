@@ -200,9 +200,9 @@ def test_what_is_not_checked_is_said(tmp_path: Path) -> None:
     write_mcap(path, enable_data_crcs=True)
     assert read_bag(path).problems == ()
     write_mcap(path, enable_crcs=False, chunk_size=10**7)
-    assert "not checked, for want of a CRC: metadata records: 1, chunks: 1" in read_bag(path).problems
+    assert "not checked, because there is no CRC: metadata records: 1, chunks: 1" in read_bag(path).problems
     write_mcap(path, use_chunking=False)
-    unchecked = f"not checked, for want of a CRC: metadata records: 1, messages outside of chunks: {3 * COUNT}"
+    unchecked = f"not checked, because there is no CRC: metadata records: 1, messages outside of chunks: {3 * COUNT}"
     assert unchecked in read_bag(path).problems
     write_mcap(path, **VARIANTS["without summary"])
     assert "file without statistics, in which a missing message would not be noticed: 1" in read_bag(path).problems

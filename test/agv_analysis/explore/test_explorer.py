@@ -108,7 +108,9 @@ def test_the_losses_of_a_run_are_judged_as_the_analysis_does(base: Scenario) -> 
     found = dict(lap_rows(base))
     analysis = analyse(simulate(base))
     assert found["Verdict"] == sentence(analysis)
-    assert found["These very losses"] == f"stable, an error grows by a factor {analysis.floquet:.6g} a step"
+    assert analysis.floquet is not None
+    shrinks = f"{100.0 * (1.0 - analysis.floquet):.2g} %"
+    assert found["This loss sequence (Floquet)"] == f"stable: errors shrink by {shrinks} per step"
 
 
 def test_of_calls_that_wait_only_the_newest_is_made(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def test_a_loop_that_leaves_the_range_of_numbers_ends_there_and_says_so() -> Non
     assert np.isfinite(run.pose).all()
     # The error grows by |1 - T_s K_x| = 9 a step, from 5 m to where ten times it, the way of one step, is no number.
     assert len(run) == math.ceil(math.log(sys.float_info.max / 50.0) / math.log(9.0)) + 1
-    assert run.notes == (f"the loop diverged: after step {len(run) - 1} of 500 the AGV left the range of numbers",)
+    assert run.notes == (f"the loop diverged: after step {len(run) - 1} of 500 the AGV's pose is no longer finite",)
     found = convergence(run)
     assert (found.settle_1cm_steps, found.damping, found.y.ise) == (None, "under", math.inf)
 
@@ -138,7 +138,7 @@ def test_a_command_beyond_the_range_of_numbers_is_refused_and_the_one_before_goe
     run = run_of(far, "controller.kx=1000000.0", "plant.duration=1.0")
     assert np.isinf(run.command[:, 0]).all()
     assert (run.pose == run.pose[0]).all()  # there is none before: the AGV stands still
-    assert run.notes == ("200 commands were beyond the range of numbers and refused, the first at step 0",)
+    assert run.notes == ("200 commands were not finite and were refused, the first at step 0",)
 
 
 def test_an_error_beyond_the_range_of_numbers_has_no_command() -> None:
