@@ -18,7 +18,7 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.stability import kanayama_delay, lifted, paper
 from agv_analysis.stability.linear_loop import kanayama_loop
-from agv_analysis.stability.margin_map import around, margin_map
+from agv_analysis.stability.margin_map import margin_map, ranges_of
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.reference.reference import Reference
 from benchmarks.comparison import Comparison
@@ -44,9 +44,9 @@ def measure() -> list[Comparison]:
     batched = _seconds(3, lambda: _all_at_once(theta, theta_held, v_held, gains, ts))
     of_lifted = _seconds(5, lambda: kanayama_delay.spectral_radius(N, 1.0, 0.1, gains, ts))
     of_companion = _seconds(1, lambda: companion_radius(N, 1.0, 0.1, gains, ts))
-    base, axes = around(scenario, ("kx", "ts"), POINTS)
-    of_map = _seconds(3, lambda: margin_map(base, ("kx", "ts"), *axes))
-    one_by_one = _seconds(1, lambda: [_largest_n(scenario, kx) for kx in axes[0].tolist()]) * POINTS
+    kx, periods = ranges_of(scenario, ("kx", "ts"), POINTS)
+    of_map = _seconds(3, lambda: margin_map(scenario, ("kx", "ts"), kx, periods))
+    one_by_one = _seconds(1, lambda: [_largest_n(scenario, kx) for kx in kx.tolist()]) * POINTS
     what, tests = "20 000 eigenvalue tests of A(k)", "tests/s"
     return [
         Comparison(what, STEPS / ours, "Python loop over numpy", STEPS / loop, tests, 20.0),

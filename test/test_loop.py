@@ -130,6 +130,7 @@ def test_bursts_below_the_border_contract_and_beyond_it_grow(drive: Drive, n: in
     assert (abs(recorded[-1]) > 1e10) == grows
     assert (abs(recorded[-1]) < 0.1) == (not grows)
     found = analyse(run)
+    assert found.paper is not None
     assert found.paper.stable  # on a straight track it is, whatever is lost
     assert found.bursts_stable == (not grows)
 

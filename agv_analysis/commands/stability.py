@@ -31,8 +31,8 @@ _SEEDS = 20
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
-    help="Instead: margins over a grid of two of kx, ky, ktheta, ts, v, curvature and speed_scale, each from a tenth "
-    "to ten times the scenario's value.",
+    help="Instead: margins over a grid of two of the control law's gains (kx, ky, ktheta), ts, v and curvature, each "
+    "from a tenth to ten times the scenario's value.",
 )  # fmt: skip
 @click.option("--points", type=click.IntRange(2, 1000), default=100, show_default=True, help="Points of each axis.")
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Where the map goes, map.csv by default.")
@@ -58,7 +58,6 @@ def command(
     from rich.markup import escape
     from rich.table import Table
 
-    from agv_analysis.report.margin_table import rows
     from agv_analysis.scenario import load_scenario
     from agv_analysis.stability.margins import margins
 
@@ -73,8 +72,9 @@ def command(
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
-    table.add_row("An outdated pose is", _POLICIES[scenario.error_detector.policy])
-    for name, value in (*rows(found, scenario.plant.ts), ("Twins of this scenario, simulated", _told(twins, seeds))):
+    policy = scenario.error_detector.policy
+    table.add_row("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
+    for name, value in (*found.rows(), ("Twins of this scenario, simulated", _told(twins, seeds))):
         table.add_row(name, escape(value))
     console.print(table)
     best, reasons = _best_gains(scenario)
@@ -85,6 +85,10 @@ def command(
         console.print(f"Best K_x: {reasons['best_kx']}")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
+    if found.infeasible:
+        console.print(f"[bold red]Infeasible:[/] {escape(found.infeasible)}.")
+    for note in found.notes:
+        console.print(f"[bold yellow]Loss-free motion:[/] {escape(note)}.")
     if found.left_out:
         console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
@@ -118,7 +122,8 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
     """
     from agv_analysis.link.markov_channel import chain_of
     from agv_analysis.stability.gains import WHY_A_TOLERANCE, best_kx
-    from agv_analysis.stability.scenario_loop import loop_of
+    from agv_analysis.stability.scenario_loop import straight_loop_of
+    from agv_cloud.control.registry import KANAYAMA
 
     chain, model = chain_of(scenario.relay.uplink), scenario.relay.uplink.model
     if scenario.error_detector.policy == "predict":
@@ -127,19 +132,26 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
         return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
     if chain.loss_rate >= 1.0:
         return {}, {"best_kx": "no answer: the scenario's uplink loses everything"}
-    return best_kx(loop_of(scenario), chain), {"almost_sure": WHY_A_TOLERANCE}
+    loop = straight_loop_of(scenario)
+    a = None if loop is None else loop.along_gain
+    if scenario.controller.law != KANAYAMA or a is None or a <= 0.0:
+        return {}, {"best_kx": "no answer: computed for Kanayama's law and a drive that obeys at once"}
+    return best_kx(chain, a / scenario.controller.kx), {"almost_sure": WHY_A_TOLERANCE}
 
 
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:
     """Write and draw the map over two axes."""
-    from agv_analysis.stability.margin_map import around, draw, margin_map, write_csv
+    from agv_analysis.commands.progress import step_bar
+    from agv_analysis.report.margin_map_files import draw, write_csv
+    from agv_analysis.stability.margin_map import margin_map, ranges_of
     from agv_ros.errors import UserError
 
     names = tuple(axes.split(","))
     if len(names) != 2:
         raise UserError(f"--map takes two axes with a comma between them, as in kx,ts; got {axes!r}")
-    base, (first, second) = around(scenario, names, points)
-    found = margin_map(base, (names[0], names[1]), first, second)
+    first, second = ranges_of(scenario, names, points)
+    with step_bar(points * points, "computing the map") as progress:
+        found = margin_map(scenario, (names[0], names[1]), first, second, progress)
     write_csv(csv_file, found)
     draw(picture, found)
     click.echo(f"map:     {csv_file}\npicture: {picture}")

@@ -33,7 +33,7 @@ def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
 
     What cannot be simulated has no rows: the page says why at once.
     """
-    from agv_analysis.report.margin_table import margin_rows
+    from agv_analysis.report.table import margin_rows
     from agv_analysis.report.verdict_sentence import sentence
     from agv_analysis.simulation.single import simulate
     from agv_analysis.stability.analysis import analyse

@@ -9,16 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.metrics.outages import outages
 from agv_analysis.report.panels import LIMIT, OTHER, REFERENCE, Panel, age, distance, speed, track
 from agv_analysis.report.plotly import figure
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
-from agv_analysis.stability import joint_spectral_radius, lifted, mean_square, paper
-from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.margins import binding
-from agv_analysis.stability.scenario_loop import loop_of_run
+from agv_analysis.stability.criteria import CRITERIA
+from agv_analysis.stability.criteria.criterion import RunFacts
 from agv_ros.parameters import SHARED
 
 _MOST_POINTS = 1200
@@ -26,12 +23,6 @@ _MOST_POINTS = 1200
 
 _MOST_DOTS = 100
 """Each of them costs a drawing more than twenty points of a line."""
-
-LATER = "see the margins of the lap"
-"""For what takes longer than a move may."""
-
-_PLACES = 100
-"""Places of the track at which the lifted system is asked: all of them would take longer than the lap."""
 
 
 class Response(NamedTuple):
@@ -81,55 +72,14 @@ def beside(panel: Panel, pinned: Panel | None) -> Panel:
 
 
 def summary_rows(run: Run) -> Iterator[tuple[str, str]]:
-    """What a run tells, and the margins that are computed at once: those of a straight track in closed form.
-
-    A loop without closed forms is left to the criteria for the whole lap.
-    """
-    loop, n = loop_of_run(run), outages(run).n_ul_max
+    """What a run tells, and what the criteria say at once; the rest is left to the criteria for the whole lap."""
+    facts = RunFacts(run)
     e = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
     late = float(e[-max(1, len(e) // 10) :].max())
     yield "Error in the last tenth", "; ".join((f"at most {late:.3g} m", *run.notes))
-    yield "Oldest pose", f"{n} steps ({n * run.ts * 1e3:g} ms)"
-    yield "Paper's test", _of_paper(run)
-    yield "Pose always that old", _of_lifted(loop, n)
-    if loop.closed_form is not None:
-        yield from _of_a_straight_track(loop)
-
-
-def _of_lifted(loop: LinearLoop, n: int) -> str:
-    """Is the loop stable if every pose is as old as the oldest? Where a word on that does not take long."""
-    if loop.is_exact:
-        return "predicted: with an exact model as without outages"
-    if not loop.is_constant and (loop.predicts or loop.closed_form is None):
-        return LATER
-    places = np.arange(0, loop.steps, max(1, loop.steps // _PLACES))  # quarters of a lap that are alike stay so
-    radius = lifted.largest_radius(loop if loop.is_constant else loop.at(places), n)
-    return f"{'stable' if radius < 1.0 else 'unstable'}, spectral radius {radius:.5g}"
-
-
-def _of_a_straight_track(loop: LinearLoop) -> Iterator[tuple[str, str]]:
-    """Margins on a straight track at the lap's top speed, of a loop with a closed form."""
-    but = ", without the predictor" if loop.predicts else ""
-    along, across = joint_spectral_radius.largest_n_straight(loop)
-    yield "Straight track, any outages", f"up to {_n(along)} along, {_n(across)} across{but}"
-    delay = lifted.critical_delay(loop)
-    yield "Straight track, delay", f"below {delay * loop.ts * 1e3:.4g} ms{but}" if delay > 0.0 else "none"
-    loss = -1.0 if loop.along_gain is None else mean_square.critical_loss_along(loop.along_gain)
-    yield "Independent losses, mean square", f"below {loss:.4g}{but}" if loss > 0.0 else "none"
-    binds = binding(loop)
-    yield "What binds", "nothing" if binds is None else f"the error {binds} the track"
-
-
-def _of_paper(run: Run) -> str:
-    """The largest n for which the paper's test holds on the track as far as it was driven."""
-    theta, v_r = run.reference[:, 2], run.reference[:, 3]
-    n = paper.largest_n(theta, v_r, run.scenario.controller, run.ts)
-    if n is None:
-        return "holds for any number of outages"
-    return "fails even without outages" if n < 0 else f"holds for up to {n} outages in a row"
-
-
-def _n(steps: int | None) -> str:
-    if steps is None:
-        return "any number"
-    return "none" if steps < 0 else str(steps)
+    yield "Oldest pose", f"{facts.n} steps ({facts.n * run.ts * 1e3:g} ms)"
+    if not facts.is_feasible:
+        yield "Without losses", facts.infeasible
+        return
+    for criterion in CRITERIA:
+        yield from criterion.at_once(facts)

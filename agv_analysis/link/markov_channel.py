@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agv_analysis.run import Floats
-from agv_plant.parameters import ChannelParameters
+from agv_plant.parameters import ChannelParameters, RelayParameters
 
 
 @dataclass(frozen=True)
@@ -118,3 +118,17 @@ def chain_of(channel: ChannelParameters) -> Chain | None:
     if channel.model == "burst":
         return Chain(np.roll(np.eye(channel.n + 1), 1, axis=1), np.eye(channel.n + 1)[0])
     return None
+
+
+def renewal_chain(relay: RelayParameters) -> Chain | None:
+    """The uplink as a chain whose outages have independent lengths.
+
+    None if it is none, if its messages come late, or if the downlink does anything to its own.
+    """
+    uplink, downlink = relay.uplink, relay.downlink
+    is_late = any(link.delay > 0.0 or link.jitter > 0.0 for link in (uplink, downlink))
+    if is_late or downlink.model != "perfect" or downlink.schedule:
+        return None
+    if uplink.model == "gilbert_elliott" and (uplink.h, uplink.k) != (0.0, 1.0):
+        return None
+    return chain_of(uplink)

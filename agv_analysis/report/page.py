@@ -135,7 +135,7 @@ def _margins(analysis: Observations) -> Iterator[tuple[str, str]]:
     if not isinstance(analysis, Analysis):
         yield "Margins", f"not computed: {GAINS_UNKNOWN}"
         return
-    from agv_analysis.report.margin_table import margin_rows
+    from agv_analysis.report.table import margin_rows
 
     try:
         if _drives_its_track(analysis.run):

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from agv_analysis.metrics.convergence import TOLERANCE, body_errors, wrapped
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability import lifted, paper
-from agv_analysis.stability.analysis import Analysis, Observations, paper_inputs
+from agv_analysis.stability.analysis import Analysis, Observations
+from agv_analysis.stability.criteria.paper_test import applies_to, paper_inputs
 from agv_analysis.stability.scenario_loop import loop_of_run
 
 TIME = "time [s]"
@@ -78,7 +79,7 @@ def panels(analysis: Observations) -> Iterator[Panel]:
     yield track(analysis.run)
     yield from time_panels(analysis.run)
     yield outage_lengths(analysis)
-    if isinstance(analysis, Analysis):
+    if isinstance(analysis, Analysis) and not analysis.infeasible:
         yield unit_circle(analysis)
 
 
@@ -192,6 +193,8 @@ def unit_circle(analysis: Analysis) -> Panel:
 
 def paper_eigenvalues(run: Run) -> NDArray[np.complex128]:
     """Eigenvalues of A(k) (eq. 55) at up to 400 steps of a run, evenly spread, shape (M,); none where it diverged."""
+    if not applies_to(run.scenario):
+        return np.empty(0, dtype=np.complex128)
     some = np.unique(np.linspace(0, len(run) - 1, _EIGENVALUE_STEPS).astype(np.int64))
     theta, theta_held, v_held = (values[some] for values in paper_inputs(run))
     matrices = paper.matrices(theta, theta_held, v_held, run.scenario.controller, run.ts)

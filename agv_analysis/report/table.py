@@ -1,13 +1,15 @@
-"""An analysis as a short table on the terminal."""
+"""An analysis, and the margins of a scenario, as short tables."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.metrics.outages import loss_causes
+from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
+from agv_analysis.stability.margins import margins
+from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
 
 
 def print_table(analysis: Observations) -> None:
@@ -85,32 +87,17 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
 
 
 def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
-    yield (
-        "Paper's test",
-        _verdict(analysis.paper.stable, f"|lambda| at most {analysis.paper.radius:.6g}, at step {analysis.paper.k}"),
-    )
-    yield (
-        f"Pose always {analysis.n} steps old",
-        _verdict(analysis.lifted_stable, f"lifted system, spectral radius {analysis.lifted_radius:.6g}"),
-    )
-    yield f"Any outages up to {analysis.n} slots", _bursts(analysis)
-    growth = math.exp(analysis.mean_square_growth)
-    both = " of both links" if analysis.verdict.criterion == "both_links" else ""
-    yield "Mean square", _verdict(growth < 1.0, f"E\\[e^2] times {growth:.6g} a step under the fitted channel{both}")
-    if analysis.floquet is not None:
-        motion = "" if analysis.contraction is None else f", {analysis.contraction:.6g} about the motion"
-        told = f"times {analysis.floquet:.6g} a step about the reference{motion}"
-        yield "These very losses", _verdict(analysis.floquet < 1.0, told)
-    colour = {
-        "asymptotic": "green",
-        "mean-square": "green",
-        "bounded": "yellow",
-        "unstable": "red",
-        "unknown": "yellow",
-    }
+    from rich.markup import escape
+
+    for found in analysis.judgements.values():
+        if found.why:
+            yield found.label, _judged(found.stable, escape(found.why))
+    colour = {ASYMPTOTIC: "green", MEAN_SQUARE: "green", BOUNDED: "yellow", UNKNOWN: "yellow"}
     verdict = analysis.verdict
-    yield "Verdict", f"[bold {colour[verdict.word]}]{verdict.word}[/] (by {verdict.criterion})"
+    yield "Verdict", f"[bold {colour.get(verdict.word, 'red')}]{verdict.word}[/] (by {verdict.criterion})"
     yield "Margin", verdict.margin
+    for note in analysis.nominal_notes:
+        yield "Loss-free motion", escape(note)
 
 
 def _fit(analysis: Observations) -> str:
@@ -126,18 +113,21 @@ def _interval(estimate: Estimate) -> str:
     return f"{estimate.value:.4f} ({estimate.low:.4f} .. {estimate.high:.4f})"
 
 
-def _verdict(stable: bool, why: str) -> str:
+def _judged(stable: bool | None, why: str) -> str:
+    if stable is None:
+        return f"[yellow]undecided[/] ({why})"
     return f"[green]stable[/] ({why})" if stable else f"[red]unstable[/] ({why})"
-
-
-def _bursts(analysis: Analysis) -> str:
-    found = analysis.bursts
-    if analysis.bursts_stable:
-        return _verdict(True, f"joint spectral radius at most {found.upper:.6g}, proved by a common norm")
-    if found.verdict == "unstable":
-        return _verdict(False, f"outages of {found.worst} slots grow by {found.lower:.6g} a step")
-    return f"[yellow]undecided[/] (joint spectral radius at least {found.lower:.6g})"
 
 
 def _steps(steps: int | None, ms: float) -> str:
     return "never" if steps is None else f"{steps} steps ({steps * ms / 1e3:g} s)"
+
+
+def margin_rows(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """Name and value of each margin of a scenario over its track, and what none of them knows of, as plain text."""
+    found = margins(scenario)
+    yield from found.rows()
+    for note in found.notes:
+        yield "Loss-free motion", note
+    if found.left_out:
+        yield "Left out of all of these", ", ".join(found.left_out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
-from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
+from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, INFEASIBLE, MEAN_SQUARE, UNKNOWN
 
 
 def sentence(analysis: Observations) -> str:
@@ -30,6 +30,8 @@ def sentence(analysis: Observations) -> str:
         )
     if word == UNKNOWN:
         return f"Whether the loop is stable cannot be said: {analysis.verdict.margin.removeprefix('unknown: ')}."
+    if word == INFEASIBLE:
+        return f"The AGV does not keep to its track even on a perfect link: {analysis.infeasible}."
     if word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
     return f"The AGV does not keep to its track: {met} are too much for these gains."

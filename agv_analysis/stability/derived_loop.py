@@ -92,7 +92,7 @@ def _assembled(
     P = _policy_derivatives(scenario, model, rows, found.command, v_r[:points], w_r[:points])
     keep = _that_matters(A, B, D, L_z, v_r, w_r)
     q = int(np.count_nonzero(keep < ERRORS))
-    some = np.ix_(range(points), keep, keep)
+    some = np.ix_(np.arange(points), keep, keep)
     return LinearLoop(
         ts=scenario.plant.ts, v_r=v_r, w_r=w_r, A=np.ascontiguousarray(A[some]), B=np.ascontiguousarray(B[:, keep]),
         D=np.ascontiguousarray(D[:, keep, :q]), L_h=np.ascontiguousarray(found.command_of_error[:, :, :q]),

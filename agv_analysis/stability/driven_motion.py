@@ -7,7 +7,7 @@ map, with the very functions that the nodes call.
 from __future__ import annotations
 
 import numpy as np
-
+from numpy.typing import NDArray
 
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
@@ -15,8 +15,9 @@ from agv_analysis.simulation.loop import Settings, period
 from agv_analysis.simulation.parts import replacements_of
 from agv_analysis.simulation.single import settings_of
 from agv_analysis.stability.derivatives import jacobian
-from agv_analysis.stability.linear_loop import products_between
+from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.products import growths
+from agv_analysis.stability.reception_maps import reception_maps
 from agv_cloud.control.command import command
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.tracking_error import tracking_error
@@ -43,14 +44,29 @@ def growth(run: Run, first: int) -> float | None:
     """
     if not applies_to(run.scenario):
         return None
-    lost, pose, reference = run.lost[first:], run.pose[first:], run.reference[first:]
+    found = displacement_growths(run.scenario, run.pose[first:], run.reference[first:], run.lost[first:], 1)
+    return float(found[0])
+
+
+def displacement_growths(
+    scenario: Scenario, pose: Floats, reference: Floats, lost: NDArray[np.bool_], count: int | None = None
+) -> Floats:
+    """Growths (logarithms) of displacements of a whole run, largest first, shape (3,), or only the largest.
+
+    X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`; `lost` of shape (N,) says which updates
+    were lost, the first was received.
+    """
     steps = np.arange(len(lost))
     age = steps - np.maximum.accumulate(np.where(lost, 0, steps))
-    ahead = run.scenario.controller.steps_ahead
-    seen = reference[np.minimum(steps + ahead, len(steps) - 1)]
-    target = seen[steps - age, :3] if run.scenario.error_detector.policy == "align" else seen[:, :3]
-    now, held = pose_derivatives(run.scenario, pose, pose[steps - age], target, seen[:, 3:])
-    return float(growths(products_between(now, held, np.flatnonzero(age == 0), len(lost)))[0])
+    seen = reference[np.minimum(steps + scenario.controller.steps_ahead, len(steps) - 1)]
+    target = seen[steps - age, :3] if scenario.error_detector.policy == "align" else seen[:, :3]
+    now, held = pose_derivatives(scenario, pose, pose[steps - age], target, seen[:, 3:])
+    nothing = np.zeros((len(lost), 3, 2))
+    loop = LinearLoop(
+        scenario.plant.ts, reference[:, 3], reference[:, 4], A=now, B=nothing, D=held, L_h=nothing.swapaxes(1, 2),
+        L_z=nothing.swapaxes(1, 2),
+    )  # fmt: skip
+    return growths(reception_maps(loop, np.flatnonzero(age == 0), len(lost)), count)
 
 
 def next_pose(
@@ -59,9 +75,7 @@ def next_pose(
 ) -> tuple[float, float, float]:  # fmt: skip
     """X_c(k+1) from X_c(k), the pose that the edge holds, and the pose and speeds of the reference."""
     x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, x_held, y_held, theta_held)
-    v, w, _ = command(
-        x_e, y_e, theta_e, v_r, w_r, (), settings.gains, settings.ts, settings.look_ahead, settings.v_max
-    )
+    v, w, _ = command(x_e, y_e, theta_e, v_r, w_r, (), settings.gains, settings.ts, settings.look_ahead, settings.v_max)
     moved = period(Motion(x, y, theta), v, w, 0, 0.0, 0.0, settings.vehicle, settings)
     return moved.x, moved.y, moved.theta
 
@@ -79,5 +93,3 @@ def pose_derivatives(
         replaced(next_pose, replacements_of(scenario)), [*columns, settings_of(scenario)], range(6)
     ).derivative  # fmt: skip
     return np.ascontiguousarray(found[:, :, :3]), np.ascontiguousarray(found[:, :, 3:])
-
-

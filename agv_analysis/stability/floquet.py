@@ -7,7 +7,6 @@ shrinks errors by hundreds of powers of ten. The loop is stable if the largest o
 - `constant_delay`: the pose is n steps old at every step (the lifted system of dimension m + q n, never formed), held
   or moved on by the plant's model;
 - `drop_sequence`: the sequence of losses is given, one verdict a step; between receptions it is held, or predicted;
-- `trajectory`: the same about the motion that was really driven, which may be far from the reference.
 
 A predictor behind a constant delay. It moves C z(k-n) on under the commands that it sent, so with the innovations
 nu(j) = E_z z(j) + E_h h(j), what a step of the plant does and the model does not know (`LinearLoop.innovation`),
@@ -32,10 +31,8 @@ from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radius
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
-from agv_analysis.stability.linearisation import loop_jacobians
 from agv_analysis.stability.products import growths, multiply
 from agv_analysis.stability.reception_maps import reception_maps
-from agv_cloud.parameters import ControllerParameters
 
 _COLUMNS = 4
 """Directions followed at once, more than a complex pair of multipliers needs."""
@@ -210,30 +207,3 @@ def drop_sequence(loop: LinearLoop, lost: NDArray[np.bool_], count: int | None =
     if not len(received):
         return np.zeros(count or loop.size)
     return growths(reception_maps(loop, received, received[0] + len(lost)), count)
-
-
-def trajectory(
-    pose: Floats,
-    reference: Floats,
-    lost: NDArray[np.bool_],
-    gains: ControllerParameters,
-    ts: float,
-    align: bool = False,
-) -> Floats:
-    """As `drop_sequence`, linearised about the motion that was driven instead of about the reference.
-
-    X_c(k) of shape (N, 3), X_r(k) and its speeds of shape (N, 5), frame `map`; the policy is `hold` or, with `align`,
-    that. The growths are those of a displacement of the whole run, in [m, m, rad] of the map. For Kanayama's law on
-    Euler's unicycle.
-    """
-    age = np.arange(len(lost)) - np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
-    taken = np.arange(len(lost)) - age
-    if align:
-        reference = np.hstack((reference[taken, :3], reference[:, 3:]))
-    now, outdated = loop_jacobians(pose, pose[taken], reference, gains, ts)
-    nothing = np.zeros((len(lost), 3, 2))
-    driven = LinearLoop(
-        ts, reference[:, 3], reference[:, 4], A=now, B=nothing, D=outdated, L_h=nothing.swapaxes(1, 2),
-        L_z=nothing.swapaxes(1, 2),
-    )  # fmt: skip
-    return growths(reception_maps(driven, np.flatnonzero(age == 0), len(lost)))

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats
-from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import along_spectral_radius
 
 TOLERANCE = 0.1
@@ -79,10 +78,10 @@ def _antiderivative(u: Floats) -> Floats:
     return np.asarray(u * np.log(np.abs(u), where=u != 0.0, out=np.zeros_like(u)) - u)
 
 
-def best_kx(loop: LinearLoop, chain: Chain) -> dict[str, float]:
+def best_kx(chain: Chain, advance: float) -> dict[str, float]:
     """Best K_x [1/s] by objective under a channel; delay and bursts for its mean burst, rounded up.
 
-    Of the loop counts only how far a command moves the AGV along the track, not the gain that it has.
+    `advance` [s] is how far a commanded speed of 1 m/s moves the AGV along the track in a step: T_s if it is obeyed.
     """
     n = math.ceil(chain.mean_burst - 1e-9)
     best = {
@@ -92,7 +91,7 @@ def best_kx(loop: LinearLoop, chain: Chain) -> dict[str, float]:
         "mean_square": best_in_mean_square(chain)[0],
         "almost_sure": best_almost_surely(chain)[0],
     }
-    return {objective: a / loop.advance for objective, a in best.items()}
+    return {objective: a / advance for objective, a in best.items()}
 
 
 def minimum(f: Callable[[float], float], low: float, high: float) -> tuple[float, float]:

@@ -73,7 +73,7 @@ def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | No
     The first is -1 if not even a loop without losses is proved stable, the second None if there is none up to `limit`;
     both None: stable up to `limit`. They are neighbours unless what lies between them is undecided.
     """
-    refuted = next((n for n, growth in enumerate(_repeated_growths(loop, limit + 1)) if growth > MARGINAL), None)
+    refuted = first_refuted(loop, limit)
     proved, beyond = -1, limit + 1 if refuted is None else refuted
     attempt = beyond - 1  # just below what is refuted: nearly always proved at once
     while proved < beyond - 1:
@@ -83,6 +83,11 @@ def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | No
             beyond = attempt
         attempt = (proved + beyond) // 2
     return (None if proved == limit else proved), refuted
+
+
+def first_refuted(loop: LinearLoop, limit: int) -> int | None:
+    """Smallest n whose repetition does not die out, None if there is none up to `limit`."""
+    return next((n for n, growth in enumerate(_repeated_growths(loop, limit + 1)) if growth > MARGINAL), None)
 
 
 def largest_n_straight(loop: LinearLoop) -> tuple[int | None, int | None]:

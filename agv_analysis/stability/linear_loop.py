@@ -62,6 +62,12 @@ class LinearLoop:
     """Shape (R, q, q); None for a policy that keeps the error of the pose that it holds."""
     P_u: Floats | None = None
     """Shape (R, q, 2), None with P_h."""
+    nominal: Floats | None = None
+    """States of the nominal motion, shape (R, all states), where they were computed; None: zero error."""
+    active_limits: tuple[str, ...] = ()
+    """A sentence for each limit that the nominal motion runs into."""
+    not_differentiable: tuple[str, ...] = ()
+    """Where a step has no derivative: the place in the code, and the first step of the lap concerned."""
     closed_form: ControllerParameters | None = None
     """Gains, K_x times true over commanded speed, if this is Kanayama's law and Euler's unicycle at zero error.
 
@@ -178,11 +184,6 @@ class LinearLoop:
         """Does x_e go its own way, as along a straight track with an immediate drive? Behind a predictor nothing is."""
         ahead, fed = self.F[:, 0] - np.eye(self.size)[0], self.G[:, 0, 1:]
         return not self.predicts and float(max(np.abs(ahead).max(), np.abs(fed).max(initial=0.0))) <= _ROUNDING
-
-    @property
-    def advance(self) -> float:
-        """How far 1 m/s of commanded speed moves the AGV within a step [m per m/s]: T_s, times true over commanded."""
-        return float(np.hypot.reduce(self.B[0, :2, 0]))
 
     def at(self, steps: NDArray[np.int64]) -> LinearLoop:
         """The loop at some steps of its lap, shape (n,), as a lap of its own."""

@@ -21,10 +21,7 @@ from __future__ import annotations
 import numpy as np
 
 from agv_analysis.run import Floats
-from agv_cloud.control.command import limit_speed
-from agv_cloud.control.kanayama import kanayama
 from agv_cloud.parameters import ControllerParameters
-from agv_cloud.tracking_error import tracking_error
 
 
 def plant_matrices(v_r: Floats, w_r: Floats, ts: float) -> tuple[Floats, Floats]:
@@ -48,36 +45,3 @@ def step_matrices(v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: flo
     """F and G at the speeds v_r [m/s], w_r [rad/s] of shape (N,); each of shape (N, 3, 3)."""
     A, B = plant_matrices(v_r, w_r, ts)
     return A, B @ command_matrices(v_r, gains)
-
-
-def loop_jacobians(
-    pose: Floats, held: Floats, reference: Floats, gains: ControllerParameters, ts: float
-) -> tuple[Floats, Floats]:
-    """Derivatives of X_c(k+1) with respect to X_c(k) and to X_c(k-n), about any motion; each of shape (N, 3, 3).
-
-    `pose` = X_c(k) and `held` = X_c(k-n) of shape (N, 3), `reference` = x, y, theta, v_r, w_r at step k, shape (N, 5),
-    frame `map`. For Euler's step (the paper's eq. 100) under `kanayama` and `limit_speed`; a command at the limit
-    does not answer to the error along the track. A(k) of eq. 55 is their sum at zero error.
-    """
-    theta, v_r = pose[:, 2], reference[:, 3]
-    x_e, y_e, theta_e, v = np.array([_answer(r, h, gains) for r, h in zip(reference, held, strict=True)]).T
-    free = (np.abs(v) < gains.v_max).astype(np.float64)
-    zero = np.zeros(len(pose))
-    now = np.broadcast_to(np.eye(3), (len(pose), 3, 3)).copy()
-    now[:, 0, 2], now[:, 1, 2] = -ts * v * np.sin(theta), ts * v * np.cos(theta)
-    command_of_error = np.array([
-        [free * gains.kx, zero, -free * v_r * np.sin(theta_e)],
-        [zero, v_r * gains.ky, v_r * gains.ktheta * np.cos(theta_e)],
-    ])  # fmt: skip
-    cos, sin = np.cos(held[:, 2]), np.sin(held[:, 2])
-    error_of_pose = np.array([[-cos, -sin, y_e], [sin, -cos, -x_e], [zero, zero, zero - 1.0]])
-    pose_of_command = ts * np.array([[np.cos(theta), zero], [np.sin(theta), zero], [zero, zero + 1.0]])
-    return now, np.asarray(np.einsum("ijk,jlk,lmk->kim", pose_of_command, command_of_error, error_of_pose))
-
-
-def _answer(reference: Floats, held: Floats, gains: ControllerParameters) -> tuple[float, float, float, float]:
-    """The error that the edge sees at one step, and the speed that it commands."""
-    x_r, y_r, theta_r, v_r, w_r = reference.tolist()
-    x_e, y_e, theta_e = tracking_error(x_r, y_r, theta_r, *held.tolist())
-    v, _ = kanayama(x_e, y_e, theta_e, v_r, w_r, gains.kx, gains.ky, gains.ktheta)
-    return x_e, y_e, theta_e, limit_speed(v, gains.v_max)

@@ -33,7 +33,7 @@ def loop_on_lap(scenario: Scenario) -> LinearLoop:
     Raises TrackFileError if the track's file cannot be used, NoNominalMotionError if the loop does not settle even
     without losses.
     """
-    return _along(scenario, lap_of(scenario))
+    return loop_along(scenario, lap_of(scenario))
 
 
 @functools.lru_cache(maxsize=256)
@@ -47,11 +47,14 @@ def straight_loop_of(scenario: Scenario) -> LinearLoop | None:
 
 def loop_of_run(run: Run) -> LinearLoop:
     """The loop of a run over its steps, which count as a lap. Raises NoNominalMotionError as `loop_on_lap`."""
-    return _along(run.scenario, run.reference)
+    return loop_along(run.scenario, run.reference)
 
 
-def _along(scenario: Scenario, reference: Floats) -> LinearLoop:
-    """The loop along any lap, rows x, y, theta, v_r, w_r, shape (N, 5); a law that looks ahead sees the rows to come."""
+def loop_along(scenario: Scenario, reference: Floats) -> LinearLoop:
+    """The loop along any lap, rows x, y, theta, v_r, w_r, shape (N, 5).
+
+    A law that looks ahead is given the rows to come. Raises NoNominalMotionError as `loop_on_lap`.
+    """
     ahead = scenario.controller.steps_ahead
     v_r, w_r = (np.roll(reference[:, column], -ahead) for column in (3, 4))
     return linear_loop(scenario, v_r, w_r)

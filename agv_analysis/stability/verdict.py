@@ -24,6 +24,8 @@ from dataclasses import dataclass
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
 UNKNOWN = "unknown"
 """For a run that no criterion here covers."""
+INFEASIBLE = "infeasible"
+"""For a loop that does not settle even without losses."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,11 @@ def judge(n: int, n_bursts: int | None, mean_square_growth: float, burst_left: f
     if v_max < float("inf"):
         return Verdict(BOUNDED, "v_max", f"none: {beyond}; only the limit on the speed bounds the error")
     return Verdict(UNSTABLE, "mean_square", f"none: {beyond}, and under the fitted channel the mean square grows")
+
+
+def judge_infeasible(why: str) -> Verdict:
+    """Verdict on a loop that does not settle even without losses: there is no motion about which it could be stable."""
+    return Verdict(INFEASIBLE, "nominal_motion", f"none: {why}")
 
 
 def judge_late(n: int | None, radius: float, v_max: float) -> Verdict:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +12,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.sweep.plan import Axis, varied
 
 if TYPE_CHECKING:
-    from agv_analysis.link.markov_channel import Chain
-
-BORDERS = ("mean square", "almost surely")
-"""Names of the borders."""
+    from agv_analysis.stability.criteria.criterion import Border
 
 _BORDER_VALUES = 40
 """Values of an axis for a smooth border."""
@@ -58,35 +54,16 @@ def margins(base: Scenario, axes: Sequence[Axis], points: Sequence[tuple[Any, ..
     """How far each point is from the borders of stability along a straight track: negative where it is stable.
 
     By name of the border, shape (points,); NaN where theory is silent: another channel, late messages, losses on the
-    downlink, a predicted pose. T_s K_x is that of the AGV's true speed.
-
-    mean square:    T_s K_x (E[n_ul] + 1/2) - 1, for independent lengths of outages
-    almost surely:  the Lyapunov exponent E[log|1 - T_s K_x L|] / E[L], L steps from one reception to the next
+    downlink, a predicted pose, a loop without an error along the track of its own.
     """
-    found = np.array([_margins(varied(base, axes, point)) for point in points]).reshape(-1, 2)
-    return dict(zip(BORDERS, found.T, strict=True))
+    borders = _borders()
+    scenarios = [varied(base, axes, point) for point in points]
+    found = np.array([[border.value(scenario) for border in borders] for scenario in scenarios])
+    return {border.name: found[:, i] for i, border in enumerate(borders)}
 
 
-def _margins(scenario: Scenario) -> tuple[float, float]:
-    from agv_analysis.stability.almost_sure import exponent_along
+def _borders() -> list[Border]:
+    """Those of the criteria that have one."""
+    from agv_analysis.stability.criteria import CRITERIA
 
-    chain, a = _renewals(scenario), scenario.plant.ts * scenario.controller.kx * scenario.plant.speed_scale
-    if chain is None or scenario.error_detector.policy == "predict":
-        return math.nan, math.nan
-    return a * (chain.mean_age + 0.5) - 1.0, exponent_along(a, chain)
-
-
-def _renewals(scenario: Scenario) -> Chain | None:
-    """The uplink as a chain whose outages have independent lengths.
-
-    None if it is none, if its messages come late, or if the downlink does anything to its own.
-    """
-    from agv_analysis.link.markov_channel import chain_of
-
-    uplink, downlink = scenario.relay.uplink, scenario.relay.downlink
-    is_late = any(link.delay > 0.0 or link.jitter > 0.0 for link in (uplink, downlink))
-    if is_late or downlink.model != "perfect" or downlink.schedule:
-        return None
-    if uplink.model == "gilbert_elliott" and (uplink.h, uplink.k) != (0.0, 1.0):
-        return None
-    return chain_of(uplink)
+    return [criterion.border for criterion in CRITERIA if criterion.border is not None]

@@ -42,5 +42,6 @@ CRITERION = Criterion(
     asks="Does a small error die out in every run but a set of probability 0?",
     assumes="The linear loop; far from the reference `hold` leaves its range long before.",
     margins=_margins,
+    margin_names=(("p_max.almost_sure", "Independent losses, almost surely"),),
     border=Border("almost surely", _border),
 )

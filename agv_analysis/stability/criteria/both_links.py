@@ -40,4 +40,5 @@ CRITERION = Criterion(
     asks="Does E[|e|^2] die out if commands are lost as well as poses?",
     assumes="Two finite Markov chains that lose independently, and a plant that holds its command or stops.",
     margins=_margins,
+    margin_names=(("both_links.mean_square_growth", "Both links as they are, mean square"),),
 )

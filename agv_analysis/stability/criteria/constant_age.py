@@ -96,6 +96,7 @@ CRITERION = Criterion(
     assumes="A constant delay; outages make the age a sawtooth, which is less.",
     judge=_judge,
     margins=_margins,
+    margin_names=(("n_max.lifted", "Pose always n steps old"), ("delay_margin", "Delay margin, straight track")),
     at_once=_at_once,
     map_column=MapColumn("n_lifted", "largest constant n", largest_delays, _of_loop),
 )

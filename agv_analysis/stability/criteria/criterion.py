@@ -186,6 +186,8 @@ class Criterion:
     judge: Callable[[RunFacts], Judgement | None] = lambda _: None
     """What it says of a run; None where it does not apply."""
     margins: Callable[[ScenarioFacts], Iterable[Margin]] = nothing
+    margin_names: tuple[tuple[str, str], ...] = ()
+    """Name and label of each of its margins, for a loop of which none can be computed."""
     at_once: Callable[[RunFacts], Iterable[Row]] = nothing
     """What is known in a few milliseconds, for a page on which a slider moves."""
     border: Border | None = None
@@ -200,5 +202,3 @@ def finite(value: float) -> float | None:
 def steps_text(n: int, ts: float) -> str:
     """A number of steps that a scenario can take, with its time."""
     return "does not contract even without outages" if n < 0 else f"{n} steps ({n * ts * 1e3:g} ms)"
-
-

@@ -103,6 +103,10 @@ CRITERION = Criterion(
     assumes="That the channel is a finite Markov chain; of a run the one that is fitted to it.",
     judge=_judge,
     margins=_margins,
+    margin_names=(
+        ("p_max.mean_square", "Independent losses, mean square"),
+        ("burst_max.mean_square", "Bursts, mean square"),
+    ),
     at_once=_at_once,
     border=Border("mean square", _border),
 )

@@ -107,5 +107,6 @@ CRITERION = Criterion(
     assumes="That the outdated pose is the current one; so on a straight track it cannot see outages at all.",
     judge=_judge,
     margins=_margins,
+    margin_names=(("n_max.paper", "Paper's test, constant n_ul"),),
     at_once=_at_once,
 )

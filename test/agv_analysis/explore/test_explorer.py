@@ -273,12 +273,11 @@ def test_moving_a_slider_simulates_anew(page: Page) -> None:
 def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    from agv_analysis.report.margin_table import rows
     from agv_analysis.stability.margins import margins
 
     def expected(kx: float) -> dict[str, str]:
         changed = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=kx))
-        return dict(rows(margins(changed), 0.005))
+        return dict(margins(changed).rows())
 
     def shown() -> dict[str, str]:
         cells = "[...row.cells].map(cell => cell.innerText)"

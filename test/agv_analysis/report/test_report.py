@@ -367,6 +367,7 @@ def test_old_poses_are_no_outages(delay: float, expected: str) -> None:
 
 def test_eigenvalues_that_are_drawn_are_those_that_were_judged(lap: Analysis) -> None:
     assert np.abs(lifted_multipliers(lap)).max() == pytest.approx(lap.lifted_radius, rel=1e-9)
+    assert lap.paper is not None
     assert np.abs(paper_eigenvalues(lap.run)).max() <= lap.paper.radius * (1.0 + 1e-9)
 
 

@@ -77,7 +77,7 @@ def test_the_closed_form_is_taken_where_it_holds_and_nowhere_else() -> None:
 
 # -- loops written anew ----------------------------------------------------------------------------------------------
 
-Step = Callable[[Sequence[float], Sequence[float], float, float], list[float]]
+Step = Callable[[Any, Any, float, float], list[float]]
 """(z, h, v_r, w_r) -> z a step later: state, error that the edge takes for the current one, reference's speeds."""
 
 

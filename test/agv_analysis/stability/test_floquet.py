@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,10 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.run import Run
-from agv_analysis.scenario import Scenario, load_scenario
-from agv_analysis.simulation import simulate
-from agv_analysis.stability.floquet import constant_delay, drop_sequence, largest_constant_delay, trajectory
+from agv_analysis.stability.floquet import constant_delay, drop_sequence, largest_constant_delay
 from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.products import growths, log_spectral_radius, ordered_product
@@ -111,37 +107,6 @@ def test_nothing_received_is_an_open_loop() -> None:
     lost = np.ones(20, dtype=np.bool_)
     loop = kanayama_loop(np.ones(20), np.zeros(20), ControllerParameters(), TS)
     assert drop_sequence(loop, lost).tolist() == [0.0, 0.0, 0.0]
-
-
-# -- the motion that was driven --------------------------------------------------------------------------------------
-
-
-def scenario_of(v_max: float, model: str) -> Scenario:
-    setting = [f"relay.uplink.{model}", "relay.uplink.p=0.4", "relay.uplink.n=5", "plant.duration=0.505"]
-    return load_scenario(CONFIG, [*setting, "error_detector.lap_time=1.0", f"controller.v_max={v_max}"])
-
-
-def started(scenario: Scenario, pose: Floats) -> Run:
-    x, y, theta = pose.tolist()
-    return simulate(
-        dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, initial_pose=(x, y, theta)))
-    )
-
-
-@pytest.mark.parametrize("v_max", [math.inf, 6.0])
-@pytest.mark.parametrize("model", ["model=perfect", "model=bernoulli", "model=burst"])
-def test_a_run_by_its_numerical_derivative(v_max: float, model: str) -> None:
-    """100 steps far off the reference, each column of dX_c(100) / dX_c(0) from two displaced runs."""
-    scenario, start, h = scenario_of(v_max, model), np.array([0.3, 0.6, 1.2]), 1e-6
-    run = started(scenario, start)
-    derivative = np.column_stack([
-        (started(scenario, start + h * unit).pose[100] - started(scenario, start - h * unit).pose[100]) / (2.0 * h)
-        for unit in np.eye(3)
-    ])  # fmt: skip
-    truth = np.sort(np.log(np.abs(np.linalg.eigvals(derivative))))[::-1]
-    found = trajectory(run.pose[:100], run.reference[:100], run.lost[:100], scenario.controller, TS)
-    np.testing.assert_allclose(found[:2], truth[:2], atol=1e-5)
-    assert found[2] == pytest.approx(truth[2], abs=0.05)  # of 1e-9: what differences of 1e-6 can tell
 
 
 # -- long products ---------------------------------------------------------------------------------------------------

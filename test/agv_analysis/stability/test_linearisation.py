@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from agv_analysis.stability.linearisation import loop_jacobians, step_matrices
-from agv_analysis.stability.paper import matrices
-from agv_cloud.control.command import limit_speed
+from agv_analysis.stability.linearisation import step_matrices
 from agv_cloud.control.kanayama import kanayama
 from agv_cloud.parameters import ControllerParameters
 from agv_cloud.tracking_error import tracking_error
@@ -62,44 +59,3 @@ def test_the_shapes_follow_the_speeds() -> None:
     for k in range(3):
         F_k, G_k = step_matrices(v[k : k + 1], w[k : k + 1], ControllerParameters(), TS)
         np.testing.assert_array_equal((F[k], G[k]), (F_k[0], G_k[0]))
-
-
-# -- about any motion ------------------------------------------------------------------------------------------------
-
-
-def step(pose: Floats, held: Floats, reference: Floats, by: ControllerParameters) -> Floats:
-    x_r, y_r, theta_r, v_r, w_r = reference.tolist()
-    error = tracking_error(x_r, y_r, theta_r, *held.tolist())
-    v, w = kanayama(*error, v_r, w_r, by.kx, by.ky, by.ktheta)
-    x, y, theta = pose.tolist()
-    return np.array(euler_step(x, y, theta, limit_speed(v, by.v_max), w, TS))
-
-
-@pytest.mark.parametrize("v_max", [math.inf, 6.0])
-def test_derivatives_of_the_loop_far_from_its_reference(v_max: float) -> None:
-    random, by, h = np.random.default_rng(8), ControllerParameters(kx=8.0, ky=1.5, ktheta=2.5, v_max=v_max), 1e-6
-    pose, held = random.uniform(-2.0, 2.0, (2, 60, 3))
-    reference = random.uniform(-2.0, 2.0, (60, 5))
-    now, outdated = loop_jacobians(pose, held, reference, by, TS)
-    limited = 0
-    for k in range(60):
-        answers = [step(pose[k], held[k] + d, reference[k], by) for d in h * np.vstack((np.eye(3), -np.eye(3)))]
-        np.testing.assert_allclose(
-            outdated[k], np.array([answers[i] - answers[i + 3] for i in range(3)]).T / (2 * h), atol=1e-8
-        )
-        answers = [step(pose[k] + d, held[k], reference[k], by) for d in h * np.vstack((np.eye(3), -np.eye(3)))]
-        np.testing.assert_allclose(
-            now[k], np.array([answers[i] - answers[i + 3] for i in range(3)]).T / (2 * h), atol=1e-8
-        )
-        limited += not outdated[k, :2].any()
-    assert limited == 0 if math.isinf(v_max) else 5 < limited < 55
-
-
-def test_a_of_the_paper_is_their_sum_at_zero_error() -> None:
-    random = np.random.default_rng(9)
-    held = random.uniform(-2.0, 2.0, (40, 3))
-    pose, speeds = random.uniform(-2.0, 2.0, (40, 3)), random.uniform(-2.0, 2.0, (40, 2))
-    now, outdated = loop_jacobians(pose, held, np.hstack((held, speeds)), ControllerParameters(), TS)
-    np.testing.assert_allclose(
-        now + outdated, matrices(pose[:, 2], held[:, 2], speeds[:, 0], ControllerParameters(), TS), atol=1e-14
-    )

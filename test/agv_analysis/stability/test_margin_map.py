@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
+from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.almost_sure import exponent_along
 from agv_analysis.stability.gains import (
     best_almost_surely,
@@ -20,12 +21,12 @@ from agv_analysis.stability.gains import (
     best_in_mean_square,
     best_kx,
 )
-from agv_analysis.stability.linear_loop import kanayama_loop
-from agv_analysis.stability.margin_map import Point, largest_delays, largest_repeated_burst, margin_map
-from agv_cloud.parameters import ControllerParameters
+from agv_analysis.stability.margin_map import margin_map
+from agv_analysis.stability.margin_map_points import Point, largest_delays, largest_repeated_burst
 from agv_ros.errors import UserError
 
 REPOSITORY = Path(__file__).parents[3]
+SCENARIO = load_scenario(str(REPOSITORY / "config/paper.yaml"), ["error_detector.track=line"])
 CANONICAL = Point(kx=25.0, ky=1.0, ktheta=2.0, ts=0.005, v=1.0, curvature=0.0)
 Floats = NDArray[np.float64]
 
@@ -106,18 +107,18 @@ def test_degenerate_points() -> None:
 
 def test_a_map_is_its_points() -> None:
     first, second = np.array([5.0, 25.0, 250.0]), np.array([0.0, 0.5])
-    found = margin_map(CANONICAL, ("kx", "curvature"), first, second)
+    found = margin_map(SCENARIO, ("kx", "curvature"), first, second)
     expected = [
         largest_delays([CANONICAL._replace(kx=float(kx), curvature=float(c)) for c in second]).tolist() for kx in first
     ]
-    assert found.n_lifted.tolist() == expected
-    assert found.n_bursts.tolist() == [[78, 78], [14, 14], [0, 0]]
+    assert found.margins["n_lifted"].tolist() == expected
+    assert found.margins["n_bursts"].tolist() == [[78, 78], [14, 14], [0, 0]]
 
 
 @pytest.mark.parametrize(("axes", "said"), [(("kx", "mass"), "no axis 'mass'"), (("kx", "kx"), "two different axes")])
 def test_a_map_without_sense(axes: tuple[str, str], said: str) -> None:
     with pytest.raises(UserError, match=said):
-        margin_map(CANONICAL, axes, np.ones(2), np.ones(2))
+        margin_map(SCENARIO, axes, np.ones(2), np.ones(2))
 
 
 def test_the_command_writes_the_map(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
@@ -197,9 +198,8 @@ def test_the_exponent_itself_has_no_best_gain() -> None:
 
 
 def test_best_gains_in_their_units() -> None:
-    loop = kanayama_loop(np.ones(1), np.zeros(1), ControllerParameters(), 0.005)
-    found = best_kx(loop, gilbert_elliott(0.02, 0.2))
+    found = best_kx(gilbert_elliott(0.02, 0.2), 0.005)
     assert found["no_outages"] == pytest.approx(200.0)
     assert found["delay"] == pytest.approx(200.0 * 5**5 / 6**6)
     assert found["mean_square"] < found["bursts"] < found["no_outages"]
-    assert best_kx(loop, bernoulli(0.0))["mean_square"] == pytest.approx(200.0, rel=1e-4)
+    assert best_kx(bernoulli(0.0), 0.005)["mean_square"] == pytest.approx(200.0, rel=1e-4)

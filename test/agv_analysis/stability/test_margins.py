@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from agv_analysis.scenario import load_scenario
+from agv_analysis.stability.criteria.any_outages import binding
 from agv_analysis.stability.linear_loop import kanayama_loop
-from agv_analysis.stability.margins import Margins, binding, margins
+from agv_analysis.stability.margins import Margins, margins
 from agv_cloud.parameters import ControllerParameters
 
 REPOSITORY = Path(__file__).parents[3]

@@ -19,7 +19,7 @@ from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.margins import margins
 from agv_analysis.stability.reception_maps import burst_maps
-from agv_analysis.stability.scenario_loop import loop_of
+from agv_analysis.stability.scenario_loop import loop_on_lap
 from agv_cloud.parameters import ControllerParameters
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
@@ -134,7 +134,7 @@ def test_twins_behind_a_predictor_confirm_the_bursts(scale: float, n: int, contr
     )  # fmt: skip
     found = simulate_batch([wanted], [1], twins=True)["contraction"][0, 0]
     assert (found < 0.5) == contracts
-    word = joint_spectral_radius.verdict(loop_of(wanted), n).verdict
+    word = joint_spectral_radius.verdict(loop_on_lap(wanted), n).verdict
     assert (word == joint_spectral_radius.STABLE) == contracts
 
 
@@ -169,6 +169,6 @@ def test_the_verdict_knows_the_policy(policy: str, word: str) -> None:
 
 
 def test_held_is_the_default() -> None:
-    loop = loop_of(scenario())
+    loop = loop_on_lap(scenario())
     assert not loop.predicts
     assert loop.closed_form == scenario().controller

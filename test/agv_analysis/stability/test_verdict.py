@@ -106,6 +106,7 @@ def test_runs_on_both_sides_of_the_border_of_bursts() -> None:
     unstable = of(*BURST_16)
     assert unstable.verdict.word == "unstable"
     assert unstable.floquet == pytest.approx((9 / 8) ** (1 / 17), rel=2e-3)  # the last burst is cut short
+    assert unstable.paper is not None
     assert unstable.paper.stable  # the blind spot
 
 
@@ -129,6 +130,7 @@ def test_random_losses_on_both_sides_of_the_mean_square_border(p: float, word: s
     """p* = 0.88235 for K_x = 25."""
     found = of("relay.uplink.model=bernoulli", f"relay.uplink.p={p}", "error_detector.track=line")
     assert found.fit.model == "bernoulli"
+    assert found.mean_square_growth is not None
     assert (found.mean_square_growth < 0.0) == (word == "mean-square")
     # 20 000 slots at 50 % have outages of 12 to 20: only beyond 14 is the sequence not survived whatever comes.
     assert found.verdict.word == (word if found.n > 14 else "asymptotic")
