@@ -1,1 +1,1 @@
-"""The edge cloud: reference track, tracking error, control law."""
+"""The edge cloud: reference, staleness policies, tracking error, control laws; error detector and controller."""

@@ -1,12 +1,12 @@
 """The freshest pose at an edge that steps by its own clock, and what that clock says in the AGV's time.
 
 Theory of operation. Behind a real radio lost slots are not announced, and two hosts have two clocks. The edge therefore
-steps by its own clock, in the time that the AGV's stamps are made of. Own time minus stamp is the clocks' offset plus
+steps by its own clock, in the time of the AGV's stamps. Own time minus stamp is the clocks' offset plus
 the time that a pose was under way; the least of the last while is taken for the offset, so that the edge is late by the
 least delay and never ahead. It is forgotten after 10 to 20 s, since one clock may run slower than the other.
 
-A stamp that is more than a second away from that time is not believed; but where stamps stay away, the AGV or its clock
-has started anew, and the edge begins again with the last of them.
+A stamp that is more than a second away from that time is rejected; but if this persists, the AGV or its clock has been
+restarted, and the edge begins again with the last of these stamps.
 
 No clock, no thread, no ROS in here: poses and instants go in.
 """
@@ -19,17 +19,17 @@ from agv_ros.stamps import NS_PER_S
 WINDOW_NS = 10 * NS_PER_S
 """Least offsets are taken over this time and the one before it."""
 
-BELIEVED_NS = NS_PER_S
+ACCEPTED_NS = NS_PER_S
 """A stamp may be this far from the time that the edge knows."""
 
 IN_A_ROW = 5
-"""So many stamps that are not believed, one after the other, are a new beginning."""
+"""This many rejected stamps, one after the other, are a new beginning."""
 
 
 class FreshestPose:
     """Keeps the freshest pose and the AGV's time; instants are [ns], `now_ns` on the edge's own clock.
 
-    `future` counts stamps that were more than a period ahead of the time that the edge knew, believed or not;
+    `future` counts stamps that were more than a period ahead of the time that the edge knew, rejected or not;
     `outdated` poses that came after a fresher one, or a second time; `beginnings` the runs: 1 is the first one.
     """
 
@@ -39,7 +39,7 @@ class FreshestPose:
         self.first_ns = 0
         """Stamp of the first pose of the run."""
         self._least_ns = self._least_before_ns = self._window_since_ns = 0
-        self._unbelieved = 0
+        self._rejected = 0
         self.future = 0
         self.outdated = 0
         self.beginnings = 0
@@ -60,13 +60,13 @@ class FreshestPose:
             self._begin(pose, now_ns)
             return True
         self.future += ahead_ns > self._ts_ns
-        if abs(ahead_ns) > BELIEVED_NS:
-            self._unbelieved += 1
+        if abs(ahead_ns) > ACCEPTED_NS:
+            self._rejected += 1
             self.outdated += ahead_ns < 0
-            if self._unbelieved == IN_A_ROW:
+            if self._rejected == IN_A_ROW:
                 self._begin(pose, now_ns)
-            return self._unbelieved == 0
-        self._unbelieved = 0
+            return self._rejected == 0
+        self._rejected = 0
         self._learn(now_ns - pose.stamp_ns, now_ns)
         if pose.stamp_ns <= self.pose.stamp_ns:
             self.outdated += 1
@@ -78,7 +78,7 @@ class FreshestPose:
         self.pose, self.first_ns = pose, pose.stamp_ns
         self._least_ns = self._least_before_ns = now_ns - pose.stamp_ns
         self._window_since_ns = now_ns
-        self._unbelieved = 0
+        self._rejected = 0
         self.beginnings += 1
 
     def _learn(self, difference_ns: int, now_ns: int) -> None:

@@ -1,6 +1,6 @@
-"""What the edge makes of a pose at a step: the tracking error, and the reference ahead.
+"""The tracking error of a step from a pose, and the reference ahead.
 
-The whole of the error detector that is no messages: reference, staleness policy and tracking error put together.
+The error detector without its messages: reference, staleness policy and tracking error put together.
 """
 
 from __future__ import annotations

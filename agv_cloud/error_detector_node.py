@@ -54,7 +54,7 @@ from agv_ros.stamps import NS_PER_S
 from agv_ros.transforms import TransformBroadcaster
 
 TIMER = "timer"
-"""What edge/age says of its slots, in place of an outcome."""
+"""Stands on edge/age in place of an outcome."""
 
 _PATH_TOPIC = "edge/path"
 
@@ -77,7 +77,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._hears_paths = False
         self._refusal = ""
         self._transforms = TransformBroadcaster(self, FRAME_REFERENCE)
-        if not self._transforms.available:  # said here only: there is no loop without this node
+        if not self._transforms.available:  # logged here only: there is no loop without this node
             self.get_logger().info("tf2_msgs is not installed: no node of this loop publishes transforms on /tf")
         self._error_out = self.output(Odometry, "edge/error")
         plans, is_path = settings.plan_steps > 0, settings.track == PATH

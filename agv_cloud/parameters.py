@@ -116,7 +116,7 @@ _STALE_TRIALS = (
     (Pose(0.0, 0.0, 0.0), Pose(0.0, 0.0, 0.0), ReferencePoint(0.0, 0.0, 0.0, 1.0, 0.0), 0.0, 0.0),
     (Pose(0.1, -0.2, 0.3), Pose(0.2, 0.1, 0.2), ReferencePoint(0.3, 0.2, 0.1, 0.5, 0.1), 0.6, -0.1),
 )
-"""Poses and speeds with which a policy must be able to deal."""
+"""Poses and speeds that a policy must handle."""
 
 
 _KANAYAMA = CONTROL_LAWS.own_part(KANAYAMA)
@@ -184,4 +184,4 @@ class ControllerParameters(_OwnControllerParameters):
 
 
 _TRIALS = ((0.0, 0.0, 0.0, 1.0, 0.0), (0.1, -0.2, 0.3, 0.5, 0.1))
-"""Errors [m, m, rad] and speeds of the reference [m/s, rad/s] with which a law must be able to deal."""
+"""Errors [m, m, rad] and speeds of the reference [m/s, rad/s] that a law must handle."""

@@ -17,7 +17,7 @@ from agv_ros.stamps import Grid, Steps
 
 
 class SlotStepping:
-    """Turns poses and slots into steps; `blind` counts slots before the first pose, which have none to go by."""
+    """Turns poses and slots into steps; `blind` counts slots before the first pose, which cannot be answered."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid

@@ -1,4 +1,4 @@
-"""A step that the edge takes: its number, and the pose that it goes by."""
+"""A step that the edge takes: its number, and the pose that it uses."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class TimerStepping:
     def add_pose(self, pose: StampedPose, now_ns: int) -> bool:
         """Take a pose that has just come, `now_ns` on the edge's clock; does a run begin with it?
 
-        One begins when the AGV is heard for the first time, and when it has started anew. Raises OutsideRunError.
+        One begins with the first pose of the AGV, and when the AGV has been restarted. Raises OutsideRunError.
         """
         beginnings = self.freshest.beginnings
         self.freshest.offer(pose, now_ns)

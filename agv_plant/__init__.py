@@ -1,1 +1,1 @@
-"""The shop floor and the air: the AGV and the radio channel."""
+"""The AGV and the radio channel: vehicle, channel models, links; the nodes plant and relay."""

@@ -16,7 +16,7 @@ DOWNLINK_POLICIES = ("hold", "zero", "ramp", "buffer")
 def share_of_command(n: int, policy: int, steps: float) -> float:
     """Share of the newest command's speeds that the AGV drives n steps after it was sent, 1 for n = 0.
 
-    `ramp` reaches 0 after `steps` > 0; the plan of `buffer`, which is then the command, has so many steps ahead.
+    `ramp` reaches 0 after `steps` > 0; the plan of `buffer`, which is then the command, is `steps` steps long.
     """
     if policy == RAMP:
         return max(0.0, 1.0 - n / steps)

@@ -31,7 +31,7 @@ class _OwnPlantParameters(LoopParameters):
     )
     vehicle: str = parameter(
         UNICYCLE,
-        "vehicle; unicycle: turns as it is told, the paper's, bicycle: steers its front wheel; what vehicles have of "
+        "vehicle; unicycle: turns as commanded, the paper's, bicycle: steers its front wheel; what vehicles have of "
         "their own has their name before it",
         choices=VEHICLES.names(),
         remedy=VEHICLES.remedy,

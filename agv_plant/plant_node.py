@@ -56,7 +56,7 @@ def progress_line(k: int, steps: float) -> str:
 
 
 def progress_of(line: str) -> int | None:
-    """The step in a line of the plant's log, None if it speaks of something else."""
+    """The step in a line of the plant's log, None if the line is not about one."""
     found = re.search(r"step (\d+) of \S+$", line)
     return int(found[1]) if found else None
 

@@ -20,7 +20,7 @@ R = TypeVar("R")
 DRAWS = 4
 
 _BLOCK = 64
-"""Steps whose normal numbers are made at once: in real time that must take no time to speak of."""
+"""Steps whose normal numbers are made at once: in real time that must take a negligible time."""
 
 
 def uniforms(seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:

@@ -24,7 +24,7 @@ from agv_ros.messages import InvalidMessageError
 from agv_ros.node import LoopNode, Output
 
 _LOOK_PERIOD = 1.0
-"""How often [s] the relay looks whether anything but itself joins the AGV's domain and the edge's."""
+"""How often [s] the relay checks that nothing but itself connects the AGV's domain and the edge's."""
 
 
 class RelayNode(LoopNode[RelayParameters]):
@@ -63,7 +63,7 @@ class RelayNode(LoopNode[RelayParameters]):
             if side.count_publishers(topic) > own:
                 self.fail(
                     f"{topic} comes into domain {side.context.get_domain_id()} around the relay: "
-                    "what this run shows would not be what the channel does; end whatever else publishes it there"
+                    "this run would not show the effect of the channel; stop whatever else publishes it there"
                 )
 
     def _on_pose(self, data: bytes) -> None:
@@ -104,7 +104,7 @@ def _counts(name: str, link: Link) -> dict[str, str]:
 
 
 def _place_in(pose: bytes, is_odometry: bool, last: tuple[float, float]) -> tuple[float, float]:
-    """Where a pose says that the AGV is [m]; `last` if it cannot be read, which is for its receiver to complain of."""
+    """Where a pose says that the AGV is [m]; `last` if it cannot be read, which its receiver reports."""
     try:
         return (decode_odometry(pose) if is_odometry else decode_pose(pose))[1:3]
     except InvalidMessageError:

@@ -1,4 +1,4 @@
-"""Errors that are for the person who made them."""
+"""Errors that the user can correct."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ def add(executor: Executor, node: LoopNode[Any]) -> None:
 
 
 def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = None) -> None:
-    """Body of a node's `main`: make it, run it until it ends or is told to stop, and exit with its status.
+    """Body of a node's `main`: make it, run it until it ends or is stopped, and exit with its status.
 
     What is wrong with a parameter or a file is said in one line, with exit status 1.
     """

@@ -1,4 +1,4 @@
-"""Pairing a slot's outcome with the message that it speaks of.
+"""Pairing a slot's outcome with the message that it refers to.
 
 Theory of operation. The relay sends two messages for a slot: the forwarded one, if it was delivered, and the outcome,
 always. They travel on two topics, so either may come first. The outcome names the stamp of the freshest message that
@@ -59,7 +59,7 @@ class MessageSync(Generic[M]):
         self._held: M | None = None
         self._settled_ns = 0
         self._last_slot_ns = 0
-        self._is_ahead = False  # the messages have begun a run whose slot 0 is still to come
+        self._is_ahead = False  # the messages have begun a run whose slot 0 has not come yet
         self.outdated = 0
         self.unanswered = 0
 
@@ -115,7 +115,7 @@ class MessageSync(Generic[M]):
         return next((i for i, slot in enumerate(self._waiting) if self._is_here(slot.freshest_ns)), None)
 
     def _forget_what_waits_in_vain(self) -> None:
-        """Where one of the two topics is dead, the other must not fill the memory."""
+        """If one of the two topics is silent, the other must not fill the memory."""
         while len(self._waiting) > MOST_WAITING:
             del self._waiting[0]
             self.unanswered += 1

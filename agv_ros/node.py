@@ -48,7 +48,7 @@ CHANGED = "changed "
 """Key, before a parameter's name, under which a node's diagnostics say how it was changed last while the node ran."""
 
 ENDED = "ended"
-"""Key in a node's last diagnostics: what it says there of its messages is final."""
+"""Key in a node's last diagnostics: its counts of messages there are final."""
 
 
 class Output:
@@ -97,7 +97,7 @@ class LoopNode(Node, Generic[P]):
         self._uses_arguments = node_options.get("use_global_arguments", True)
         self._own_arguments = node_options.get("cli_args")
         self.sides: list[Node] = []
-        """What this node is in other DDS domains; to be spun with it."""
+        """This node's participants in other DDS domains; to be spun with it."""
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
         self.add_on_set_parameters_callback(self._on_set_parameters)
 
@@ -153,7 +153,7 @@ class LoopNode(Node, Generic[P]):
         def receive(data: bytes) -> None:
             try:
                 callback(data)
-            except UserError:  # nothing that another message could mend
+            except UserError:  # no other message can repair that
                 raise
             except ValueError as error:  # InvalidMessageError, OffGridError
                 self.reject(topic, data, error)
@@ -187,16 +187,16 @@ class LoopNode(Node, Generic[P]):
         timer = self.create_timer(_POLL_PERIOD, again, clock=self._steady)
 
     def is_settled(self) -> bool:
-        """Has everything that is still on its way to this node arrived? Asked for a moment when it is told to stop."""
+        """Has everything that is on its way to this node arrived? Polled for a moment when the node is stopped."""
         return True
 
     def close(self) -> None:
-        """Called once, after the last callback: say for the last time what was published."""
+        """Called once, after the last callback: report for the last time what was published."""
         self._ended = True
         self.report(self._last_ns)
 
     def flush(self, seconds: float) -> None:
-        """Wait until all that was published has arrived, `seconds` at most: who has died acknowledges nothing."""
+        """Wait until all that was published has arrived, `seconds` at most: a dead subscriber acknowledges nothing."""
         deadline = time.monotonic() + seconds
         for output in self.outputs:
             output.flush(max(0.0, deadline - time.monotonic()))
@@ -237,7 +237,7 @@ class LoopNode(Node, Generic[P]):
             self.report(stamp_ns)
 
     def _period_of(self, stamp_ns: int) -> int:
-        """The step in whose period an instant lies: other people's robots do not keep to the grid."""
+        """The step in whose period an instant lies: the stamps of other robots are not on the grid."""
         return (stamp_ns - self.grid.start_ns) // self.grid.ts_ns
 
     def report(self, stamp_ns: int) -> None:

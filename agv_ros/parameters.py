@@ -257,7 +257,7 @@ class LoopParameters:
     )
     stop_timeout: float = parameter(
         1.2,
-        "a node that is told to stop waits this long, at most, for messages on their way to it or to its "
+        "a node that is stopped waits this long, at most, for messages on their way to it or to its "
         "subscribers; a recorder on a busy machine may lag by seconds",
         unit="s",
         low=0.0,
@@ -271,7 +271,7 @@ class LoopParameters:
     )
     look_ahead: float = parameter(
         0.0,
-        "how far ahead in time the reference is that edge/error tells of, rounded to whole periods, the same on all "
+        "how far ahead in time the reference of edge/error is, rounded to whole periods, the same on all "
         "nodes; 0: that of now; for a control law that looks ahead",
         unit="s",
         low=0.0,
@@ -280,7 +280,7 @@ class LoopParameters:
     frame_prefix: str = parameter(
         "",
         "what the frames base_link and reference begin with, in messages and on /tf, as robot_state_publisher has it: "
-        "agv1/ for one AGV of several; the frame map is everyone's",
+        "agv1/ for one AGV of several; all share the frame map",
     )
 
     @property
@@ -294,7 +294,7 @@ SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_step
 
 @dataclass(frozen=True)
 class TwoDomains(LoopParameters):
-    """What a node must know that stands between the AGV and the edge where each has a DDS domain of its own."""
+    """Parameters of a node between the AGV and the edge where each has a DDS domain of its own."""
 
     plant_domain_id: int = parameter(
         -1, "ROS_DOMAIN_ID of the AGV; -1: the one that this process was started in", low=-1, high=232

@@ -25,7 +25,7 @@ _LONGEST_INTEGER = 24
 
 
 class RosYamlError(UserError):
-    """A text that is no YAML to ROS; says why and where."""
+    """A text that ROS does not accept as YAML; says why and where."""
 
 
 def load(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""Speeds over the next steps on the wire: trajectory_msgs/MultiDOFJointTrajectory <-> plain values, as in `wire`.
+"""Speeds over the next steps on the wire: trajectory_msgs/MultiDOFJointTrajectory <-> plain values, as in `codec`.
 
 One point a step, the first at the stamp, each with one velocity and its time from the start.
 """
@@ -72,7 +72,7 @@ def _decode_points(order: str, data: bytes) -> tuple[tuple[float, float], ...]:
         raise InvalidMessageError(f"{count} steps of speeds, must be 1 to {_MOST_POINTS}")
     values = _points(order, count, position).unpack_from(data, _HEADER + position)
     if any(values[i::11] != (wanted,) * count for i, wanted in ((0, 0), (1, 1), (8, 0))):
-        raise InvalidMessageError("a step of speeds has not one velocity and nothing else")
+        raise InvalidMessageError("a step must have exactly one velocity and nothing else")
     speeds = tuple(zip(values[2::11], values[7::11], strict=True))
     if not all(math.isfinite(v) and math.isfinite(w) for v, w in speeds):
         raise InvalidMessageError("speeds are not finite")

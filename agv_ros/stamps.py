@@ -50,14 +50,14 @@ class Grid(NamedTuple):
 
 
 MAX_LEAP = 1_000_000
-"""Most steps between two messages of a run that are believed: 83 minutes at 5 ms."""
+"""Most steps between two messages of a run that are accepted: 83 minutes at 5 ms."""
 
 MAX_FIRST = 100_000_000
 """Latest step at which a node may join a running loop: 5.8 days at 5 ms."""
 
 
 class Steps:
-    """Steps of a running loop: as `Grid.step`, but one wild stamp cannot send a node far into the future."""
+    """Steps of a running loop: as `Grid.step`, but a single wrong stamp cannot send a node far into the future."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -70,14 +70,14 @@ class Steps:
         if k > latest:
             raise OffGridError(
                 f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, the last one seen was {self._last}; "
-                f"steps up to {latest} are believed: do all nodes have the same start_time?"
+                f"steps up to {latest} are accepted: do all nodes have the same start_time?"
             )
         self._last = k
         return k
 
 
 class NearestSteps:
-    """Steps of stamps that keep to no grid, as another robot's: each counts for the nearest step since the first."""
+    """Steps of stamps that are on no grid, as another robot's: each is assigned to the nearest step since the first."""
 
     def __init__(self, ts_ns: int) -> None:
         self._ts_ns = ts_ns

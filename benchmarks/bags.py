@@ -180,7 +180,7 @@ class Template(NamedTuple):
 
 
 def make_bag(path: Path, messages: int) -> int:
-    """Write an MCAP file as the recorder does, of at least so many messages; returns their number."""
+    """Write an MCAP file as the recorder does, of at least `count` messages; returns their number."""
     template = _template()
     per_chunk = sum(map(len, template.entries.values()))
     chunks = -(-messages // per_chunk)

@@ -22,7 +22,7 @@ class Comparison(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """How many times as good as the peer; nan where neither can be told from zero."""
+        """How many times as good as the peer; NaN where both are zero within the resolution."""
         better, worse = (self.peer, self.ours) if self.smaller_is_better else (self.ours, self.peer)
         return better / worse if worse else float("nan")
 

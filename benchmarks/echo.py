@@ -113,7 +113,7 @@ class Echo:
 
 
 def echo(shape: str, steps: int, executor_name: str, roles: Sequence[str]) -> float:
-    """Rounds per second of the ring. Without the plant among the roles: 0, when the process is told to stop."""
+    """Rounds per second of the ring. Without the plant among the roles: 0, when the process is stopped."""
     with stop_on_signals() as stop:
         context = rclpy.Context()
         rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)

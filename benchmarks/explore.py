@@ -1,4 +1,4 @@
-"""How fast the explorer answers: a lap of 20 000 steps simulated anew, its margins, and what the browser gets to draw.
+"""How fast the explorer answers: a lap of 20 000 steps simulated again, its margins, and what the browser gets to draw.
 
 The peer is what a person bears: an answer within 0.2 s is one to the hand that moves the slider. It is measured in the
 server alone, and, where Chromium is installed, in the browser from the key that moves the slider to the frame that

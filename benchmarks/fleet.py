@@ -54,7 +54,7 @@ def _most(cores: int, processes: int) -> int:
 
 
 def _is_carried(cores: int, processes: int, count: int) -> bool:
-    """Run a fleet on so many cores, divided among so many processes."""
+    """Run a fleet on a number of cores, divided among a number of processes."""
     per_process = count // processes
     allowed = sorted(os.sched_getaffinity(0))[:cores]
     parts: list[subprocess.Popen[str]] = []
@@ -90,7 +90,7 @@ def run(count: int, first: int, number: int) -> int:
     scenario = load_scenario(CONFIG, ["plant.clock=realtime", "plant.duration=1000.0"])
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, 20.0), strict=True))
     names = list(fleet)[first : first + number]
-    told = threading.Event()
+    may_measure = threading.Event()
     window: list[tuple[int, int]] = []
     with stop_on_signals() as stop, OneProcess() as process:
         loops = [loop_of(process, fleet[name], None, name) for name in names]
@@ -100,16 +100,16 @@ def run(count: int, first: int, number: int) -> int:
             return sum(plant.deadline_monitor.missed for plant in plants)
 
         def look(steps: int) -> None:
-            if not listener.is_alive() and not told.is_set() and all(plant.k for plant in plants):
+            if not listener.is_alive() and not may_measure.is_set() and all(plant.k for plant in plants):
                 print(READY, end="", flush=True)
                 listener.start()
-            if told.is_set() and len(window) < 2 and (not window or steps - window[0][0] >= BEFORE * number):
+            if may_measure.is_set() and len(window) < 2 and (not window or steps - window[0][0] >= BEFORE * number):
                 window.append((steps, missed()))
             stop.requested = len(window) == 2 and steps - window[1][0] >= WINDOW * number
 
         def listen() -> None:
             sys.stdin.readline()
-            told.set()
+            may_measure.set()
 
         listener = threading.Thread(target=listen, daemon=True)
         run_loops(EXECUTORS["events"](context=process.context), loops, stop, look)

@@ -1,4 +1,4 @@
-"""Reading bags without ROS: recordings <-> numpy, with a word on everything that is wrong with them."""
+"""Reading bags without ROS: recordings <-> numpy, and a report of everything that is wrong with them."""
 
 from agv_analysis.bags.bag import Bag, Topic, read_bag
 from agv_analysis.bags.bag_errors import BagError

@@ -23,7 +23,7 @@ from agv_analysis.bags.storage import LARGE, Storage
 from agv_analysis.bags.type_hash import contradicts
 
 _THREADS = 2
-"""So many topics are checked at a time."""
+"""Topics that are checked at a time."""
 
 Progress = Callable[[int], None]
 """Called with the share of a bag that has been read [%], every now and then."""

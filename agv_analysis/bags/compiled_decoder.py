@@ -19,7 +19,7 @@ from agv_analysis.compiled import HAS_NUMBA, compiled
 from agv_ros.stamps import NS_PER_S
 
 MAX_LAYOUTS = 32
-"""Each message is compared with so many layouts at most."""
+"""Most layouts that a message is compared with."""
 
 
 class Run(NamedTuple):

@@ -90,7 +90,7 @@ _AHEAD = 3 * _TOGETHER
 """Bytes that may be inflated ahead, unless a single chunk has more; a processor's cache holds them until their turn."""
 
 _MAX_DAMAGES = 10_000
-"""So many damaged places are passed over in a file."""
+"""Damaged places of a file that are skipped, at most."""
 
 
 class _Run(NamedTuple):

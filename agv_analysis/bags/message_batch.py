@@ -129,7 +129,7 @@ def gather(buffer: Bytes, starts: Ints, size: int) -> Bytes:
 
 
 def number(buffer: Bytes, place: int, size: int) -> int:
-    """The little-endian number of so many bytes at a place; a single load, once compiled."""
+    """The little-endian number of `size` bytes at a place; a single load, once compiled."""
     value = np.int64(0)
     for i in range(size):
         value |= np.int64(buffer[place + i]) << (8 * i)

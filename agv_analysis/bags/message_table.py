@@ -19,7 +19,7 @@ from agv_analysis.bags.prefault import Prefault
 from agv_analysis.bags.schema import STRING, Struct
 
 _MISFITS_BELIEVED = 100
-"""So many messages, and not one of its type: then the definition is not theirs."""
+"""After this many messages, none of which is of its type, the definition is not theirs."""
 
 _PADDING_FREE = 64 * 2**20
 _PADDING_FACTOR = 16
@@ -81,7 +81,7 @@ class Table:
     def __init__(self, kind: Struct, expected: int = 0, helper: Executor | None = None) -> None:
         """`expected`: messages to make room for; more may come.
 
-        `helper` makes memory ready; it is given where messages are so many that this, and compiled code, pay.
+        `helper` prepares memory; it is given where there are enough messages for this, and compiled code, to pay off.
         """
         self._columns = {LOG_TIME: _Column("i8", []), PUBLISH_TIME: _Column("i8", []), **dict(_columns(kind))}
         self._ragged = kind.has_sequences
@@ -198,7 +198,7 @@ class Table:
             self._plans.clear()
 
     def _make_room(self, number: int) -> None:
-        """Make room for so many more rows."""
+        """Make room for `number` more rows."""
         if self._count + number > self._capacity:
             self._move(self._dtype, self._count + number, max(2 * self._capacity, self._expected))
         self._prefault.reach((self._count + number) * self._dtype.itemsize)

@@ -34,14 +34,14 @@ TYPE_HASH = "topic_type_hash"
 """Key in a channel's metadata that holds the hash of its type."""
 
 Read = Callable[[int, int], bytes]
-"""Up to so many bytes (second argument) from a place (first), fewer at the end."""
+"""Bytes from a place (first argument), as many as the second one says, or fewer at the end."""
 
 _SHAPES = {
     HEADER: "bb", FOOTER: "884", SCHEMA: "2bbb", CHANNEL: "22bbb", CHUNK: "8884bB", MESSAGE_INDEX: "2b",
     CHUNK_INDEX: "8888b8b88", ATTACHMENT: "88bbB4", ATTACHMENT_INDEX: "88888bb", STATISTICS: "82444488b",
     METADATA: "bb", METADATA_INDEX: "88b", SUMMARY_OFFSET: "188", DATA_END: "4",
 }  # fmt: skip
-"""Parts of each kind of record: so many bytes, or a block after its length of 4 (b) or 8 (B) bytes."""
+"""Parts of each kind of record: a number of bytes, or a block after its length of 4 (b) or 8 (B) bytes."""
 
 
 def is_known(opcode: int) -> bool:

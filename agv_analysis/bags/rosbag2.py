@@ -24,7 +24,7 @@ _PACKED = ".zstd"
 
 _MOST_TIMES = 1000
 _ALWAYS_UNPACKED = 2**30
-"""A file may inflate to so many times its size, or to so many bytes."""
+"""A file may decompress to this many times its size, or to this many bytes."""
 
 _PIECE = 2**22
 

@@ -29,7 +29,7 @@ _BATCH_BYTES = 2**24
 _LEAD = struct.Struct("<qq")
 
 _MOST_SAID = 10
-"""So many complaints of sqlite3 are passed on."""
+"""Most error messages of sqlite3 that are passed on."""
 
 
 class RosbagsFile:

@@ -19,7 +19,7 @@ _AHEAD = 2**18
 
 _WINDOW = 2**22
 _MAX_CANDIDATES = 200_000
-"""So many places of a file are looked at in search of records; more only a file made for the purpose has."""
+"""Most places of a file at which a record is searched for; only a malicious file has more."""
 
 _INDEX_HEAD = struct.Struct("<BQHI")
 """Opcode, length, channel and bytes of entries of a message index, the commonest record outside of chunks."""

@@ -12,7 +12,7 @@ from agv_analysis.commands import with_settings
 @click.option("--port", type=click.IntRange(0, 65535), default=8050, show_default=True, help="0: any free one.")
 @click.option("--no-browser", is_flag=True, help="Only say where the page is.")
 def command(params: str, settings: tuple[str, ...], port: int, no_browser: bool) -> None:
-    """Explore the params file PARAMS in the browser: every move of a slider simulates the lap anew. Ctrl-C ends it.
+    """Explore the params file PARAMS in the browser: every move of a slider simulates the lap again. Ctrl-C stops it.
 
     \b
     Examples:

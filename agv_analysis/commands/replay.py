@@ -72,7 +72,7 @@ def command(
     if scenario.error_detector.track == PATH and (again or (on_dds and edge == "own")):
         raise UserError(
             f"{bag}: its reference came as paths, which are not in it, so its edge and its run cannot be rerun; "
-            "--compare alone goes by the recorded reference"
+            "only --compare works, with the recorded reference"
         )
     if again:
         _drive_again(run, scenario, ros, json_file)

@@ -1,4 +1,4 @@
-"""What if? A page on this machine on which settings are moved and the lap is simulated anew at every move.
+"""What if? A page on this machine on which settings are changed and the lap is simulated again at every change.
 
 `settings` turns what is on the page into a scenario, `respond` a scenario into figures and numbers, `app` is the page.
 """

@@ -2,7 +2,7 @@
 
 A run judges itself only as far as it goes: an error that has settled when the run ends may leave its band afterwards.
 What a run cannot say is None: the share of an initial error of zero, the settling that did not happen, the damping of a
-command that did not move or that ended before it could be told.
+command that did not move or that ended too early.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from agv_ros.stamps import NS_PER_S, Grid
 TOPIC = "/diagnostics"
 
 _REPORTS = f"{PUBLISHED}{TOPIC}".encode()
-"""Key of a node's count of its own reports, which begins anew with each process."""
+"""Key of a node's count of its own reports, which starts again with each process."""
 
 
 def restarts(diagnostics: NDArray[np.void], namespace: str, grid: Grid) -> Iterator[str]:
@@ -30,7 +30,7 @@ def restarts(diagnostics: NDArray[np.void], namespace: str, grid: Grid) -> Itera
         if processes > 1:
             first = sorted(stamp_ns for number, stamp_ns in found if number == min(found)[0])[1 - processes :]
             steps = ", ".join(str(max(0, (stamp_ns - grid.start_ns) // grid.ts_ns)) for stamp_ns in first)
-            yield f"{name} was started again in the middle of the run: its reports begin anew at step {steps}"
+            yield f"{name} was started again in the middle of the run: its reports start again at step {steps}"
 
 
 def _counts(message: np.void) -> Iterator[tuple[str, int]]:

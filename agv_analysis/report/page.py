@@ -158,7 +158,7 @@ def versions() -> dict[str, str]:
 
 
 def _reproduce(analysis: Observations) -> str:
-    """Commands that make this run anew; params.yaml are the parameters that the page shows."""
+    """Commands that repeat this run; params.yaml holds the parameters that the page shows."""
     if analysis.run.source == "simulation":
         return "agv-ncs simulate params.yaml --report report.html"
     return "agv-ncs run params.yaml --bag bags/again\nagv-ncs analyse bags/again --report report.html"

@@ -34,7 +34,7 @@ def sweep_sentence(rows: Rows) -> str:
 
 
 def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> None:
-    """Write the report of a sweep; `command` makes it anew. Raises UserError as `write_report`."""
+    """Write the report of a sweep; `command` repeats it. Raises UserError as `write_report`."""
     drawn = {"instability": sweep_figure(sweep, rows)} if rows and can_draw(sweep) else {}
     plain = [{name: _plain(value) for name, value in row.items()} for row in rows]
     parameters = sweep.base.to_yaml(of_all_parts=True)

@@ -27,7 +27,7 @@ class Table:
     title: str
     rows: Sequence[Values]
     named: int
-    """So many columns, from the left, say what a row is about."""
+    """Number of columns, from the left, that identify a row."""
     drawn: Sequence[str]
     """The columns that its figure shows."""
 

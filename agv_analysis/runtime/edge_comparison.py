@@ -84,7 +84,7 @@ def with_settings(scenario: Scenario, settings: Iterable[str]) -> Scenario:
 
 
 def compare(run: Run, scenario: Scenario) -> Comparison:
-    """What the edge of `scenario` makes of the recorded poses and slots, against what is recorded.
+    """Errors and commands of the edge of `scenario` from the recorded poses and slots, against the recorded ones.
 
     Raises UserError if no step of the recording has both.
     """

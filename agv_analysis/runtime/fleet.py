@@ -1,8 +1,7 @@
-"""A fleet: whole loops beside each other that share one uplink, derived from one scenario; how each of them fared.
+"""A fleet: several loops that share one uplink, derived from one scenario, and the result of each.
 
-What is everyone's: the uplink's resource blocks and their schedule, which each relay works out from the same seed. What
-is a vehicle's own: the random numbers of its downlink, its delays, its noise and slip, and its track, which lies beside
-the first vehicle's.
+All share the uplink's resource blocks and their schedule, which each relay computes from the same seed. Each vehicle
+has its own random numbers for downlink, delays, noise and slip, and its own track, beside the first vehicle's.
 """
 
 from __future__ import annotations
@@ -89,7 +88,7 @@ def _moved(pose: tuple[float, float, float], shift: tuple[float, float]) -> tupl
     return pose[0] + shift[0], pose[1] + shift[1], pose[2]
 
 
-# -- how it fared ------------------------------------------------------------------------------------------------------
+# -- results -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

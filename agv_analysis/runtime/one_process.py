@@ -19,7 +19,7 @@ N = TypeVar("N", bound=LoopNode[Any])
 R = TypeVar("R", bound=RecorderNode)
 
 _OWN_TOPICS = ["--ros-args", "-r", "/clock:=clock", "-r", "/diagnostics:=diagnostics"]
-"""What makes of the topics of all nodes those of a namespace: each vehicle of a fleet has a clock of its own."""
+"""Remaps the topics that all nodes share into the namespace: each vehicle of a fleet has a clock of its own."""
 
 
 class OneProcess:

@@ -41,7 +41,7 @@ _STOP_TIMEOUT = 20.0
 _LOOK_PERIOD = 0.1
 """How often [s] the processes are looked at while they run."""
 
-_SAY_PERIOD = 0.2
+_REPORT_PERIOD = 0.2
 """How often [s] a vehicle's process says how far it is."""
 
 _LOG_PREFIX = re.compile(r"^\[[A-Z]+\] \[[0-9.]+\] \[[^]]*\]: ")
@@ -77,7 +77,7 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
     recorder = nodes.pop("recorder", None)
     for node in nodes.values():
-        node.tell(signal.SIGINT)
+        node.send_signal(signal.SIGINT)
     for node in nodes.values():
         node.collect()
     if recorder is not None:
@@ -87,10 +87,10 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     if stop.requested:
         failure = f"interrupted after step {plant.steps}"
     elif ended:
-        failure = f"{ended[0].name} ended: {ended[0].last_words()}"
+        failure = f"{ended[0].name} ended: {ended[0].last_line()}"
     else:
-        failure = plant.last_words() if plant.status else ""
-    recording = recorder.last_words() if recorder else ""
+        failure = plant.last_line() if plant.status else ""
+    recording = recorder.last_line() if recorder else ""
     failed = recorder is not None and recorder.status != 0
     return Outcome(plant.steps, plant.pace.rate, failure, "" if failed else recording, recording if failed else "")
 
@@ -111,7 +111,7 @@ def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, prog
                     progress(sum(other.steps for other in vehicles))
         finally:
             for vehicle in vehicles:
-                vehicle.tell(signal.SIGINT)
+                vehicle.send_signal(signal.SIGINT)
             for vehicle in vehicles:
                 vehicle.collect()
         outcomes = [_outcome_of(vehicle, stop.requested) for vehicle in vehicles]
@@ -122,24 +122,24 @@ def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, prog
 def _outcome_of(vehicle: _Process, stopped: bool) -> Outcome:
     """What a vehicle's process says in its last line, unless something ended it before."""
     try:
-        return Outcome(**json.loads(vehicle.last_words()))
+        return Outcome(**json.loads(vehicle.last_line()))
     except (ValueError, TypeError):
-        failure = f"interrupted after step {vehicle.steps}" if stopped else vehicle.last_words()
+        failure = f"interrupted after step {vehicle.steps}" if stopped else vehicle.last_line()
         return Outcome(vehicle.steps, vehicle.pace.rate, failure, "", "")
 
 
 def _drive_vehicle(name: str, params: str, bag: str) -> None:
     """Body of a vehicle's process: its progress goes to standard output and, as the last line, its Outcome."""
     scenario = load_scenario(params)
-    steps, said = scenario.plant.duration / scenario.plant.ts, time.monotonic()
+    steps, last_report = scenario.plant.duration / scenario.plant.ts, time.monotonic()
 
-    def say(k: int) -> None:
-        nonlocal said
-        if time.monotonic() - said > _SAY_PERIOD:
-            said = time.monotonic()
+    def report(k: int) -> None:
+        nonlocal last_report
+        if time.monotonic() - last_report > _REPORT_PERIOD:
+            last_report = time.monotonic()
             click.echo(progress_line(k, steps))
 
-    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, say)
+    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, report)
     click.echo(json.dumps(dataclasses.asdict(outcome)))
 
 
@@ -152,7 +152,7 @@ def _node_command(name: str, params: Path, settings: dict[str, Any]) -> list[str
 
 
 class _Process:
-    """One node, or one vehicle, in a process of its own, with what it says."""
+    """One node, or one vehicle, in a process of its own, with its output."""
 
     def __init__(self, name: str, command: Sequence[str], domain_id: int = -1) -> None:
         self.name = name
@@ -192,22 +192,22 @@ class _Process:
             return True
         return False
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line that it printed."""
-        return self._lines[-1] if self._lines else f"exit status {self.status}, without a word"
+        return self._lines[-1] if self._lines else f"exit status {self.status}, without any output"
 
-    def tell(self, number: signal.Signals) -> None:
+    def send_signal(self, number: signal.Signals) -> None:
         """Send it a signal, unless it has ended."""
         if self.is_running():
             self._process.send_signal(number)
 
     def stop(self, number: signal.Signals) -> None:
-        """Tell it to end, and see to it."""
-        self.tell(number)
+        """Signal it to end, and wait for that."""
+        self.send_signal(number)
         self.collect()
 
     def collect(self) -> None:
-        """Wait for its end, which comes by force if it takes too long, and for the rest of what it said."""
+        """Wait for its end, kill it if that takes too long, and read the rest of its output."""
         if self.is_running(_STOP_TIMEOUT):
             self._process.kill()
         self._process.wait()

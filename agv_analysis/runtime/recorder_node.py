@@ -141,7 +141,7 @@ class RecorderNode(LoopNode[RecorderParameters]):
         return not self._running and not self.missing()
 
     def has_all_of(self, nodes: int) -> bool:
-        """Is everything here, after so many nodes said that they ended? What is on its way cannot be missed yet."""
+        """Is everything here, after this number of nodes has ended? Before, messages may still be on their way."""
         return len(self._published) >= nodes and self.is_settled()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The player: recorded slots and poses to the edge's nodes once more, and their answers."""
+"""The player: sends recorded slots and poses to the edge's nodes again, and collects their answers."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ _START_PATIENCE = 30.0
 """How long [s] nodes may take to start and to find each other."""
 
 _TICK = 0.001
-"""How often [s] the player looks what is due."""
+"""How often [s] the player checks what is due."""
 
 _SLOW_TICK = 0.1
-"""How often [s] it looks whether answers stay away, where these alone say what is due."""
+"""How often [s] it checks for missing answers, where the answers decide what is due."""
 
 _AGAIN = 0.5
 """After how long [s] without an answer a slot is sent again to nodes that run already."""
 
-_EARS = 8
-"""So many listeners are lent at most to nodes that wait for more than there are."""
+_MOST_EXTRA = 8
+"""Most extra subscriptions that are made for nodes which wait for more subscribers than there are."""
 
 _ANSWERS: dict[str, type] = {"edge/error": Odometry, "edge/cmd_vel": TwistStamped}
 
@@ -110,7 +110,7 @@ class ReplayNode(LoopNode[LoopParameters]):
         self._unanswered = {slot.k for slot in inputs.slots if slot.is_answered}
         self._heard = self._sent = time.monotonic()
         self._begun_ns = 0
-        self._ears: list[Subscription] = []
+        self._extra_subscriptions: list[Subscription] = []
         self._pose_out = self.output(PoseStamped, "edge/pose")
         self._slot_out = self.output(TimeReference, "edge/slot")
         self._clock_out = self.output(Clock, "/clock", side=True)
@@ -126,20 +126,20 @@ class ReplayNode(LoopNode[LoopParameters]):
     # -- before the first slot ---------------------------------------------------------------------------------------
 
     def _begin(self) -> bool:
-        """Only once the controller listens to the error detector and speaks to us: nothing is to be lost."""
+        """Only once the controller receives from the error detector and is connected to us, so that nothing is lost."""
         missing = self._who_is_missing()
         if missing:
             waited = time.monotonic() - self._heard
             if waited > _START_PATIENCE:
                 self.fail(f"{missing}, waited for {_START_PATIENCE:g} s")
-            elif self._edge_runs and len(self._ears) < min(_EARS, int(waited)) * len(_ANSWERS):
-                self._lend_ears()
+            elif self._edge_runs and len(self._extra_subscriptions) < min(_MOST_EXTRA, int(waited)) * len(_ANSWERS):
+                self._add_subscriptions()
             return self.finished
         if max(self.count_publishers("edge/slot"), self.count_publishers("edge/pose")) > 1:
             self.fail("a relay runs already and publishes edge/slot: use another namespace or ROS_DOMAIN_ID")
             return True
-        while self._ears:
-            self.destroy_subscription(self._ears.pop())
+        while self._extra_subscriptions:
+            self.destroy_subscription(self._extra_subscriptions.pop())
         self._heard, self._begun_ns = time.monotonic(), time.monotonic_ns()
         self._play_what_is_due()
         self.create_timer(_SLOW_TICK if self._pace.lockstep else _TICK, self._tick, clock=self._steady)
@@ -148,15 +148,15 @@ class ReplayNode(LoopNode[LoopParameters]):
     def _who_is_missing(self) -> str:
         if not all(output.is_heard(self.settings.wait_for_subscribers) for output in self.outputs):
             return "no error detector listens to edge/pose and edge/slot"
-        own = 1 + len(self._ears) // len(_ANSWERS) + (self.recorder is not None)
+        own = 1 + len(self._extra_subscriptions) // len(_ANSWERS) + (self.recorder is not None)
         if self.count_subscribers("edge/error") <= own or not self.count_publishers("edge/cmd_vel"):
             return "no controller listens to edge/error and sends edge/cmd_vel"
         return ""
 
-    def _lend_ears(self) -> None:
-        """One more listener to each answer, for nodes that wait for more of them than there are in a replay."""
+    def _add_subscriptions(self) -> None:
+        """One more subscription to each answer, for nodes that wait for more of them than a replay has."""
         for topic, kind in _ANSWERS.items():
-            self._ears.append(self.create_subscription(kind, topic, lambda _: None, LOOP_QOS, raw=True))
+            self._extra_subscriptions.append(self.create_subscription(kind, topic, lambda _: None, LOOP_QOS, raw=True))
 
     def _is_all_heard(self, k: int) -> bool:
         """Have the answers to step k reached both us and the recording?"""
@@ -172,7 +172,7 @@ class ReplayNode(LoopNode[LoopParameters]):
             self._send(self._slots[self.k - 1])
         self._play_what_is_due()
         if self._waits_for is None and self.k < len(self._slots):
-            self._heard = time.monotonic()  # the edge owes nothing, it is the recording that pauses
+            self._heard = time.monotonic()  # no answer is pending: the recording pauses
         elif time.monotonic() - self._heard > _PATIENCE:
             first = min(self._unanswered) if self._waits_for is None else self._waits_for
             self.fail(f"the edge does not answer step {first}, waited for {_PATIENCE:g} s")

@@ -13,7 +13,7 @@ class Speedometer:
         self._last = (0, 0.0)
 
     def see(self, steps: int) -> None:
-        """So many steps are done now."""
+        """Record that `steps` steps are done now."""
         if steps > self._last[0]:
             self._last = (steps, time.monotonic())
             self._first = self._first or self._last

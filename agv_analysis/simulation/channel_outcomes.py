@@ -1,7 +1,7 @@
 """Outcomes of a channel on a whole run, compiled: those of `agv_plant.radio.channel.Channel`, bit for bit.
 
-The same models, the same random numbers; only the loop over the slots is another one, since that of the relay asks for
-one slot at a time.
+The same models and the same random numbers; only the loop over the slots differs, since the relay evaluates one slot at
+a time.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ def _one_by_one(channel: Channel, states: States) -> Outcomes:
 
 
 model: Any = MODELS["perfect"]
-"""Of the channel that `outcomes_of_slots` is made for; as it stands here, one that loses nothing."""
+"""Of the channel that `outcomes_of_slots` is made for; by default one that loses nothing."""
 
 
 def outcomes_of_slots(

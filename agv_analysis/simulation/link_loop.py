@@ -1,8 +1,9 @@
 """Runs in which an outcome depends on the place, or messages are under way for longer than their slot.
 
-`loop` takes the outcomes of a whole run as given, and a message that is not lost as here. Where that is not so, this is
-the same loop, made of the same functions: in each slot both links are asked first, with the pose that the AGV sends,
-for the freshest message that their receivers now hold; what it said is looked up in the run so far.
+`loop` takes the outcomes of a whole run as given, and assumes that a message which is not lost arrives at once. Where
+that does not hold, this is the same loop, made of the same functions: in each slot both links are evaluated first, with
+the pose that the AGV sends, for the freshest message that their receivers now hold; its content is looked up in the run
+so far.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class Past(NamedTuple):
 
 
 def nothing_past(steps: int, memory: Numbers) -> Past:
-    """Of a run of so many steps that has not begun."""
+    """The past of a run of `steps` steps that has not begun."""
     return Past(np.empty((steps, 8)), np.empty((steps, len(memory))))
 
 
@@ -176,12 +177,12 @@ def planned(
 
 
 def recall_memory(row: NDArray[np.float64]) -> Numbers:
-    """A row of numbers as the memory of a control law; as it stands here one that has none. See `parts`."""
+    """A row of numbers as the memory of a control law; by default of one without memory. See `parts`."""
     return ()
 
 
 def store_memory(row: NDArray[np.float64], memory: Numbers) -> None:
-    """The memory of a control law as a row of numbers; as it stands here one that has none. See `parts`."""
+    """The memory of a control law as a row of numbers; by default of one without memory. See `parts`."""
 
 
 def at_the_edge(edge: EdgeState, k: int, taken: int, reference: Rows, past: Past, settings: Settings) -> EdgeState:
@@ -211,7 +212,7 @@ def history_over_links(
     reference: Rows, inputs: RunInputs, up: LinkInputs, down: LinkInputs, up_trace: LinkTrace, down_trace: LinkTrace,
     rows: NDArray[np.float64],
 ) -> int:  # fmt: skip
-    """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), and what became of its messages.
+    """One run, recorded: X_c, eps and u of slot k into rows[k], shape (N, 8), and what became of its messages.
 
     `reference` as of `loop.history`; the outcomes of `inputs` mean nothing. Returns the number of slots until the run
     ended.

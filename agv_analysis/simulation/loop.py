@@ -8,8 +8,8 @@ plain Python and compiled, so it keeps to what numba knows: floats, tuples, arra
 Control law, staleness policy and vehicle are called by placeholders (`control_law`, `staleness_policy`,
 `vehicle_step`), which `parts` replaces by those that a scenario chooses; so a loop is compiled for its own parts.
 
-What a run does not have is None: numba compiles a function anew for it, without the branch that is never taken. The
-paper's plant thus costs nothing of what can be had beside it.
+What a run does not have is None: numba compiles a function again for it, without the branch that is never taken. The
+paper's plant thus pays nothing for the options that it does not use.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Numbers = tuple[float, ...]
 
 
 class Settings(NamedTuple):
-    """What a slot needs to know of the scenario; v_max [m/s], T_s and look-ahead [s]."""
+    """Parameters of the scenario that a slot needs; v_max [m/s], T_s and look-ahead [s]."""
 
     gains: Numbers
     """Parameters of the control law, in the order of its signature."""
@@ -66,7 +66,7 @@ class Settings(NamedTuple):
 
 
 class EdgeState(NamedTuple):
-    """What the edge goes by."""
+    """What the edge computes from."""
 
     held: Pose
     """The pose that it takes for the AGV's."""
@@ -91,7 +91,7 @@ class HeldCommand(NamedTuple):
 
 
 class PlanState(NamedTuple):
-    """What the plan that the plant holds expects of the next step: the tracking error, and the law's memory."""
+    """What the plan that the plant holds predicts for the next step: the tracking error, and the law's memory."""
 
     x_e: float
     y_e: float
@@ -109,7 +109,7 @@ class Loop(NamedTuple):
 
 
 class EdgeOutput(NamedTuple):
-    """What the edge made of a slot: eps(k) [m, m, rad] and u(k) [m/s, rad/s]; the command is NaN if it sent none."""
+    """Result of the edge for a slot: eps(k) [m, m, rad] and u(k) [m/s, rad/s]; the command is NaN if it sent none."""
 
     x_e: float
     y_e: float
@@ -158,7 +158,7 @@ def slot(loop: Loop, reference: ReferencePoint, inputs: RunInputs, k: int) -> tu
         return plant_step(
             held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings
         ), sent  # fmt: skip
-    # The same again: here the compiler sees that edge and plant speak of one angle, and takes its sine only once.
+    # The same again: here the compiler sees that edge and plant use one angle, and computes its sine only once.
     edge = with_pose(loop.edge, sent_pose(loop.motion, inputs.noise, k, inputs.settings), reference)
     sent, memory = edge_step(edge, reference, inputs.settings)
     held = Loop(loop.motion, edge, loop.command, loop.plan)
@@ -197,7 +197,7 @@ def wheel_noise(slip: Rows | None, k: int) -> tuple[float, float]:
 
 
 def without_pose(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> EdgeState:
-    """No pose has come: what the edge holds is one step older, and its policy says what to make of it."""
+    """No pose has arrived: what the edge holds is one step older, and its policy is applied to it."""
     held, target = staleness_policy(
         settings.policy, edge.held, edge.target, reference, edge.v, edge.w, settings.ts, settings.model_arc,
         settings.policy_parameters,
@@ -249,7 +249,7 @@ def driven_command(
     loop: Loop, sent: EdgeOutput, memory: Numbers, held: HeldCommand, reference: ReferencePoint,
     plan_arc: bool | None, settings: Settings,
 ) -> tuple[float, float, PlanState]:  # fmt: skip
-    """What the plant drives under the command that it holds, and what its plan expects of the next step."""
+    """The command that the plant executes, from the one that it holds, and its plan's prediction of the next step."""
     if plan_arc is None:
         return held.v, held.w, loop.plan
     v, w = held.v, held.w
@@ -291,7 +291,7 @@ def are_finite(a: float, b: float, c: float) -> bool:
 
 
 def history(reference: Rows, inputs: RunInputs, rows: NDArray[np.float64], n_ul: NDArray[np.int64]) -> int:
-    """One run, written down: X_c, eps and u of slot k into rows[k], shape (N, 8), its age into n_ul[k], shape (N,).
+    """One run, recorded: X_c, eps and u of slot k into rows[k], shape (N, 8), its age into n_ul[k], shape (N,).
 
     `reference` has shape (N, 5), or as many rows more as the edge looks ahead. Returns the number of slots until the
     run ended, N at most.
@@ -332,7 +332,7 @@ class Statistics(NamedTuple):
 
 
 class MetricsAccumulator(NamedTuple):
-    """A run on its way, with what has been seen of its error so far."""
+    """A run in progress, with the metrics of its error so far."""
 
     loop: Loop
     goes_on: bool
@@ -426,7 +426,7 @@ def statistics(reference: Rows, inputs: RunInputs) -> Statistics:
 def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[Statistics, Statistics]:
     """Two runs on one reference, as `statistics`; together they take little longer than one.
 
-    A run is a chain in which everything waits for a sine of what came before; meanwhile the core works on the other.
+    Each step of a run waits for a sine from the step before; meanwhile the core works on the other run.
     """
     first, second = begin(reference, one), begin(reference, other)
     for k in range(len(one.lost)):

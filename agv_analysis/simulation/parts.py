@@ -1,4 +1,4 @@
-"""Which functions of the loop a scenario's parts take the place of, and loops that are run with them."""
+"""The functions of the loop that a scenario's parts replace, and loops that are run with them."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ def _edition(path: str) -> object:
 
 
 track: Any = TRACKS["line"]
-"""Which `drive_all` is made for; as it stands here, a straight line."""
+"""The track that `drive_all` is compiled for; by default a straight line."""
 
 
 def drive_all(points: Floats, start: tuple[float, float, float], lap: int, ts: float, speed: float) -> None:

@@ -17,7 +17,7 @@ def control_law(
 ) -> tuple[float, float, Memory]:  # fmt: skip
     """The law of a loop as the loop calls it: (v [m/s], w [rad/s], memory after the step).
 
-    As it stands here Kanayama's; where another one is chosen it is put in this one's place.
+    By default Kanayama's; another one that is chosen replaces it.
     """
     v, w = kanayama(x_e, y_e, theta_e, v_r, w_r, gains[0], gains[1], gains[2])
     return v, w, memory

@@ -43,7 +43,7 @@ class PathReference:
             self._next = None
 
     def restart(self) -> None:
-        """A run begins anew, and so does the newest path."""
+        """A run begins again, and the newest path with it."""
         if self._next is None and self._tracks:
             self._next = self._tracks[-1][1]
         self._tracks.clear()

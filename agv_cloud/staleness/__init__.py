@@ -1,4 +1,4 @@
-"""Staleness policies: what the edge makes of an outdated pose.
+"""Staleness policies: how the edge uses an outdated pose.
 
 The freshest pose that the edge holds at step k is X_c(k-n). One of three errors goes to the controller, always with the
 speeds v_r(k), w_r(k) of now: `hold` compares X_r(k) with X_c(k-n), `align` X_r(k-n) with X_c(k-n), `predict` X_r(k)

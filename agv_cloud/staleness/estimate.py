@@ -20,8 +20,7 @@ def staleness_policy(
 ) -> tuple[Pose, Pose]:  # fmt: skip
     """One step of a policy as the loop calls it: (held, target) of now, see `registry`.
 
-    As it stands here one of this package by its number; where another package's is chosen it is put in this one's
-    place.
+    By default one of this package by its number; another package's that is chosen replaces it.
     """
     if number == HOLD:
         return hold(held, target, reference)
@@ -31,7 +30,7 @@ def staleness_policy(
 
 
 class Estimate(NamedTuple):
-    """What the edge goes by at a step."""
+    """What the edge computes from at a step."""
 
     held: Pose
     target: Pose

@@ -1,6 +1,6 @@
 """Staleness policies by name: those of this package, and those of the group `agv_ncs.staleness_policies`.
 
-A policy says what the edge makes of a pose that is one step older than it was, no newer one having come. It gets the
+A policy says how the edge uses a pose that is one step older than it was, because no newer one has arrived. It gets the
 pose that the edge took for the AGV's in the step before (`held`), the one that it compared it with (`target`), each
 with x, y [m], theta [rad], and the reference of now with its speeds as well (`reference`: x, y, theta, v, w). It
 returns held and target for now. At a reception `held` is the pose received and `target` the reference of its instant.

@@ -77,7 +77,7 @@ class _SharedUplinkModel:
         self._ages = [0] * parameters.vehicles
 
     def __call__(self, channel: ChannelParameters, k: int, _: Sequence[float], state: int) -> tuple[bool, int]:
-        """As any `Model`; what it remembers of the other vehicles begins anew with slot 0."""
+        """As any `Model`; what it remembers of the other vehicles is reset in slot 0."""
         if k == 0:
             self._ages = [0] * channel.vehicles
         turns, fates = zip(*(drawn.at(k)[:2] for drawn in self._drawn), strict=True)

@@ -1,1 +1,1 @@
-"""Vehicles: what an AGV makes of a command in one sampling period."""
+"""Vehicles: the motion of an AGV under a command in one sampling period."""

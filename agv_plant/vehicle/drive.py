@@ -1,6 +1,6 @@
-"""The AGV's drive: what its motors make of a command.
+"""The AGV's drive: the speeds that its motors reach under a command.
 
-Everything is off by default, and then the command is what is driven, to the last bit: the paper's plant.
+Everything is off by default, and then the command is executed exactly: the paper's plant.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The AGV's motion in one sampling period: drive, wheels, vehicle, ground, and what its sensors make of its pose."""
+"""The AGV's motion in one sampling period: drive, wheels, vehicle, ground, and the measured pose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ States = tuple[float, ...]
 
 
 class VehicleParameters(NamedTuple):
-    """What is to be known of an AGV; the fields are the parameters of its plant."""
+    """Parameters of an AGV's motion; the fields are those of its plant."""
 
     arc: bool
     """Are poses integrated along the arc, or by Euler's step?"""
@@ -65,7 +65,7 @@ def vehicle_step(
 ) -> tuple[float, float, float, States]:  # fmt: skip
     """The vehicle of a loop as the loop calls it: pose and further states a time `dt` [s] later, see `registry`.
 
-    As it stands here a unicycle; where another vehicle is chosen it is put in this one's place.
+    By default a unicycle; another vehicle that is chosen replaces it.
     """
     x, y, theta = unicycle(x, y, theta, v, w, dt, arc)
     return x, y, theta, states
@@ -88,7 +88,7 @@ def move(motion: Motion, v: float, w: float, n_left: float, n_right: float, vehi
             x, y, theta, states, v_true, w_true, v_driven, w_driven, dt, vehicle.arc, vehicle.parameters
         )
         if vehicle.skid > 0.0:
-            # The vehicle does not go where it heads: its way is turned by the side-slip angle.
+            # The vehicle does not move along its heading: its displacement is turned by the side-slip angle.
             beta = side_slip(v_true, (theta_to - theta) / dt, vehicle.skid)
             cos, sin, dx, dy = math.cos(beta), math.sin(beta), x_to - x, y_to - y
             x_to, y_to = x + cos * dx - sin * dy, y + sin * dx + cos * dy

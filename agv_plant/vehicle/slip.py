@@ -1,4 +1,4 @@
-"""Wheels that slip and an AGV that skids: what the ground makes of the speeds that the drive gives.
+"""Wheels that slip and an AGV that skids: the speeds over the ground, from those of the drive.
 
 A driven wheel that slips by a ratio s moves over the ground at 1 - s times the speed of its rim. The two wheels of the
 AGV, a track width b apart, slip each for itself:

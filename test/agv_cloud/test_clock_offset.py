@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_cloud.clock_offset import BELIEVED_NS, IN_A_ROW, WINDOW_NS, FreshestPose
+from agv_cloud.clock_offset import ACCEPTED_NS, IN_A_ROW, WINDOW_NS, FreshestPose
 from agv_ros.messages import StampedPose
 
 MS = 1_000_000
@@ -64,7 +64,7 @@ def test_one_wild_stamp_is_counted_and_does_no_harm() -> None:
     freshest = FreshestPose(TS)
     for k in range(100):
         assert freshest.offer(pose(k * TS), k * TS + MS)
-        for wild in (10**18, k * TS + MS + BELIEVED_NS + 1):
+        for wild in (10**18, k * TS + MS + ACCEPTED_NS + 1):
             assert not freshest.offer(pose(wild), k * TS + MS)
         assert freshest.time(k * TS + MS) == k * TS
     assert (freshest.future, freshest.outdated, freshest.beginnings) == (200, 0, 1)

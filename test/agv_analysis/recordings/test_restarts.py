@@ -30,7 +30,7 @@ def test_whoever_counts_from_one_again_was_started_again() -> None:
     first = [("controller", second, second + 1) for second in range(4)]
     again = [("controller", 5, 1), ("controller", 6, 2), ("controller", 9, 1)]
     (note,) = said(*first, *again)
-    assert note == "controller was started again in the middle of the run: its reports begin anew at step 1000, 1800"
+    assert note == "controller was started again in the middle of the run: its reports start again at step 1000, 1800"
 
 
 def test_reports_that_were_out_of_order_or_missed_are_no_restart() -> None:
