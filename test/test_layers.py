@@ -7,6 +7,7 @@ import graphlib
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,6 +25,16 @@ SPEAK_ROS = {
     "agv_analysis.runtime.one_process", "agv_analysis.runtime.runner", "agv_analysis.runtime.processes",
 }  # fmt: skip
 """Beside the nodes themselves."""
+
+
+SHARED_NAMES = {
+    "__init__": "Python's name for a package's own module",
+    "registry": "each kind of part has one: channels, control laws, vehicles, staleness policies",
+    "parameters": "each side declares those of its nodes",
+    "parts": "what parts are, and which of the loop's functions they replace",
+    "reference": "the nodes' reference step by step, and the same compiled for a whole run",
+}
+"""Module file names that stand more than once, each with the reason. A command's file has the name of the command."""
 
 
 def name_of(path: Path) -> str:
@@ -76,6 +87,22 @@ def test_every_layer_is_there() -> None:
 @pytest.mark.parametrize("module", MODULES)
 def test_imports_point_one_way(module: str) -> None:
     assert upwards(module, MODULES[module].read_text(encoding="utf-8")) == []
+
+
+def test_what_speaks_ros_is_a_node_or_lives_in_agv_ros_or_runtime() -> None:
+    assert {module for module in SPEAK_ROS if not module.startswith(("agv_ros.", "agv_analysis.runtime."))} == set()
+
+
+def test_no_file_name_stands_twice_without_need() -> None:
+    named = Counter(path.stem for path in MODULES.values() if path.parent.name != "commands")
+    assert {name for name, count in named.items() if count > 1} <= set(SHARED_NAMES)
+
+
+@pytest.mark.parametrize("module", [module for module, path in MODULES.items() if path.stem == "__init__"])
+def test_each_package_says_its_job(module: str) -> None:
+    docstring = ast.get_docstring(ast.parse(MODULES[module].read_text(encoding="utf-8")))
+    assert docstring is not None
+    assert len(docstring.splitlines()[0].split()) >= 5
 
 
 def in_earnest(source: str) -> str:
