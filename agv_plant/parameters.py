@@ -54,7 +54,7 @@ class _OwnPlantParameters(LoopParameters):
     )
     downlink_policy: str = parameter(
         "hold",
-        "what the AGV does in a step whose command did not arrive; hold: it obeys the newest one, zero: it stands "
+        "what the AGV does in a step whose command did not arrive; hold: it follows the newest one, zero: it stands "
         "still, ramp: it slows down to a stand within ramp_time, buffer: it drives what was planned plan_steps ahead, "
         "then it stands still",
         choices=DOWNLINK_POLICIES,
@@ -70,10 +70,10 @@ class _OwnPlantParameters(LoopParameters):
         0.0, "time constant with which the drive follows a command; 0: at once", unit="s", low=0.0, high=60.0
     )
     slip: float = parameter(
-        0.0, "slip ratio of the wheels: share of a wheel's speed that the ground does not see", low=-1.0, high=1.0
+        0.0, "slip ratio of the wheels: share of a wheel's speed that is lost to the ground", low=-1.0, high=1.0
     )
     slip_noise: float = parameter(
-        0.0, "standard deviation of the slip ratio, drawn anew in each step, for each of the two wheels", low=0.0,
+        0.0, "standard deviation of the slip ratio, drawn in each step for each of the two wheels", low=0.0,
         high=1.0,
     )  # fmt: skip
     track_width: float = parameter(0.5, "distance between the wheels, if they slip", unit="m", above=0.0, high=100.0)
@@ -134,7 +134,7 @@ class PlantParameters(_OwnPlantParameters):
 
 
 _TRIALS = ((0.0, 0.0, 0.5, 1.0, 0.1), (1.0, -2.0, 3.0, 0.0, 0.0))
-"""Poses in frame `map` [m, m, rad] and speeds [m/s, rad/s] with which a vehicle must be able to deal."""
+"""Poses in frame `map` [m, m, rad] and speeds [m/s, rad/s] that a vehicle must handle."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class ChannelParameters:
     correlation: float = parameter(
         0.0,
         "downlink: share of slots in which it draws the uplink's random numbers; rayleigh: correlation of the two "
-        "links' complex gains; 1: one fate",
+        "links' complex gains; 1: identical",
         low=0.0,
         high=1.0,
     )
@@ -251,7 +251,7 @@ class ChannelParameters:
 
     @property
     def is_direct(self) -> bool:
-        """Is what is lost known without the AGV, and all else there in its own slot?"""
+        """Are losses independent of the AGV's place, and does every other message arrive in its own slot?"""
         return not (self.is_placed or self.delays)
 
     @property
@@ -284,7 +284,7 @@ class RelayParameters(TwoDomains):
     )
     stamps: str = parameter(
         "grid",
-        "what stamps may be; grid: sampling instants, others are refused, any: each counts for the nearest step since "
+        "what stamps may be; grid: sampling instants, others are refused, any: each means the nearest step since "
         "the first, as of a robot with a clock of its own",
         choices=("grid", "any"),
     )

@@ -1,4 +1,4 @@
-"""The AGV: publishes its pose, obeys the commands that arrive, and keeps the loop's clock.
+"""The AGV: publishes its pose, executes the commands that arrive, and keeps the loop's clock.
 
 lockstep: step k + 1 follows the answer to step k, as fast as it comes. realtime: one step every T_s, with the newest
 command held; the AGV stops when that is too old. A command that arrives within a period acts on the whole of it, as it
@@ -62,7 +62,7 @@ def progress_of(line: str) -> int | None:
 
 
 class PlantNode(LoopNode[PlantParameters]):
-    """Owns the state X_c(k) and says when k becomes k + 1."""
+    """Owns the state X_c(k) and decides when k becomes k + 1."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__("plant", PlantParameters, **node_options)
@@ -125,7 +125,7 @@ class PlantNode(LoopNode[PlantParameters]):
         self._pose_out.publish(encode_pose(pose))
 
     def _measured_pose(self) -> StampedPose:
-        """What the AGV makes known of its pose at step k."""
+        """The pose that the AGV publishes at step k."""
         plant, stamp_ns = self.settings, self.grid.stamp(self.k)
         if not plant.is_noisy:
             return StampedPose(stamp_ns, *self.state)
@@ -256,7 +256,7 @@ class PlantNode(LoopNode[PlantParameters]):
             self._advance(self._held.at(self.grid.stamp(self.k + 1)))
 
     def facts(self) -> dict[str, str]:
-        """Progress; in realtime also punctuality and what became of commands."""
+        """Progress; in realtime also deadlines and what became of commands."""
         facts = {"step": str(self.k)}
         if not self._lockstep:
             facts |= {name: f"{value:.6g}" for name, value in self.deadline_monitor.summary().items()}

@@ -1,4 +1,4 @@
-"""A recording in memory: topics as arrays, what is written about it, what is wrong with it."""
+"""A recording in memory: topics as arrays, its metadata, and what is wrong with it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Bag:
 
     path: Path
     topics: dict[str, Topic]
-    """All topics of the bag, those too that were not asked for."""
+    """All topics of the bag, including those that were not requested."""
     metadata: dict[str, dict[str, str]]
     """MCAP's Metadata records by name."""
     problems: tuple[str, ...]
@@ -173,7 +173,7 @@ class _Reading:
             if topic not in self._tables:
                 kind = parse_schema(schema.name, schema.encoding, schema.text)
                 if contradicts(schema.name, schema.text, channel.metadata.get(TYPE_HASH, "")):
-                    what = "definition of its type that has not the hash recorded with it, so that values may be wrong"
+                    what = "definition of its type that does not match the recorded hash, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
                 helper = self._helper if storage.size > LARGE else None
                 self._tables[topic] = Table(kind, storage.expected(channel.id), helper)

@@ -10,7 +10,7 @@ class BagError(UserError):
 
 
 class DamagedError(ValueError):
-    """Bytes that are not the record which they are said to be; never leaves this package."""
+    """Bytes that are not the expected record; never leaves this package."""
 
 
 class UndecodableError(ValueError):

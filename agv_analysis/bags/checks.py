@@ -13,7 +13,7 @@ from agv_ros.stamps import NS_PER_S
 
 
 def check_times(topic: str, rows: NDArray[np.void]) -> Findings:
-    """Report times that run backwards, messages that are there twice, and stamps that no clock can have shown."""
+    """Report times that run backwards, duplicate messages, and impossible stamps."""
     findings = Findings()
     log_time = np.ascontiguousarray(rows[LOG_TIME])  # one pass over the rows instead of four
     steps = np.diff(log_time)

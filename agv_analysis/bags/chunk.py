@@ -82,7 +82,7 @@ def largest_size(chunk: Chunk) -> int:
 
 
 def is_as_declared(chunk: Chunk, content: bytes) -> bool:
-    """Does the record say of the content what is true?"""
+    """Does the record describe its content correctly?"""
     return chunk.size == len(content) and chunk.compression == compression_of(chunk.content)
 
 
@@ -105,7 +105,7 @@ def rescue_chunk(length: int, left: int, read: Read) -> tuple[Chunk, int] | None
 
 
 def _readings(length: int, left: int, read: Read) -> Iterator[tuple[Chunk, int, int]]:
-    """Ways to read a chunk's record without believing one of its lengths: the chunk, where its content begins, ends."""
+    """Ways to read a chunk's record without trusting one of its lengths: the chunk, where its content begins, ends."""
     fixed = read(0, _HEAD + 4)
     size, crc = int.from_bytes(fixed[16:24], "little"), int.from_bytes(fixed[24:28], "little")
     name_length = int.from_bytes(fixed[_HEAD:], "little")

@@ -1,4 +1,4 @@
-"""What a bag says of its topics, which may be said in several places of it."""
+"""What a bag says about its topics, which may be in several places."""
 
 from __future__ import annotations
 

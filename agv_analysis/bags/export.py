@@ -39,7 +39,7 @@ def export_parquet(bag: Bag, out: Path) -> list[Path]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise BagError("Parquet is written by pyarrow, which is not to be found: `pip install pyarrow`") from None
+        raise BagError("Parquet needs pyarrow, which is not installed: `pip install pyarrow`") from None
 
     def write(rows: NDArray[np.void], path: Path) -> None:
         table = {

@@ -235,7 +235,7 @@ class McapFile:
                 self.statistics = parse_statistics(record.content)
             self._define(Definition(record.opcode, record.content), is_proven)
         if self.statistics is None:
-            self.findings.add("file without statistics, in which a missing message would not be noticed")
+            self.findings.add("file without statistics, in which a missing message would go undetected")
 
     def _footer(self, position: int) -> Footer | None:
         record = next(self._sound_records(position, position + 1), None)
@@ -347,7 +347,9 @@ class McapFile:
             except DamagedError as error:
                 self._damages += 1
                 if self._damages > _MAX_DAMAGES:
-                    self.findings.add("rest of a file with too many damages, not read", at=position, is_loss=True)
+                    self.findings.add(
+                        "rest of a file with too much damage, not read", at=position, is_loss=True
+                    )
                     return
                 item, position = self._pass_over(position, str(error))
             if item is not None:
@@ -395,7 +397,7 @@ class McapFile:
         return _Run(position, content, starts), end
 
     def _pass_over(self, position: int, why: str) -> tuple[_Packed | _Cut | None, int]:
-        """What can be made of a damaged place, and where the next record is."""
+        """What can be recovered at a damaged place, and where the next record is."""
         begin = position + RECORD.size
         left = self._source.size - begin
         head = self._source.read(position, RECORD.size)

@@ -14,7 +14,7 @@ from concurrent.futures import Executor
 from agv_analysis.bags.message_batch import Bytes
 
 _WINDOW = 2**24
-"""Bytes that are asked for at a time."""
+"""Bytes that are requested at a time."""
 
 _MADV_POPULATE_WRITE = 23
 """In <linux/mman.h>: makes pages as a write would, and leaves alone what is in those that are there."""
@@ -24,20 +24,20 @@ class Prefault:
     """Makes the pages of an array that is written from its beginning to its end, ahead of the writing."""
 
     def __init__(self, array: Bytes, helper: Executor | None) -> None:
-        """`helper` is where the kernel is waited for; without one nothing is asked for ahead."""
+        """`helper` is the thread that waits for the kernel; without one nothing is requested ahead."""
         self._array = array
         self._helper = helper if sys.platform == "linux" else None
         self._asked = 0
 
     def reach(self, end: int) -> None:
-        """Writing goes on up to byte `end`: ask for what comes behind it, if that has not been done."""
+        """Writing continues up to byte `end`: request what follows, if that has not been done."""
         while self._helper is not None and self._asked < min(end + _WINDOW, len(self._array)):
             self._helper.submit(_populate, self._array, self._asked)
             self._asked += _WINDOW
 
 
 def _populate(array: Bytes, begin: int) -> None:
-    """Ask for the whole pages of a window; a refusal does no harm."""
+    """Request the whole pages of a window; a refusal does no harm."""
     page, address = mmap.PAGESIZE, array.ctypes.data
     first = -(-(address + begin) // page) * page
     end = (address + min(begin + _WINDOW, len(array))) // page * page

@@ -1,4 +1,4 @@
-"""A damaged bag -> a clean one with everything in it that is whole."""
+"""A damaged bag -> a clean one with every complete message."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ MAX_MESSAGE = 2**28
 
 _BATCH = 4096
 _BATCH_BYTES = 2**24
-"""Messages, and bytes of them, that are handed on together."""
+"""Messages, and bytes of them, that are passed on together."""
 
 _LEAD = struct.Struct("<qq")
 
@@ -137,7 +137,7 @@ def _take_over_inflating(reader: Any) -> bool:
 
 def _remedy(path: Path) -> str:
     is_database = path.suffix == ".db3" or (path.is_dir() and any(path.glob("*.db3")))
-    return "; `sqlite3 FILE .recover | sqlite3 NEW.db3` may save what is whole" if is_database else ""
+    return "; `sqlite3 FILE .recover | sqlite3 NEW.db3` may recover what is intact" if is_database else ""
 
 
 def _check_database(path: Path, findings: Findings) -> None:

@@ -1,6 +1,6 @@
 """Whether a type's definition is the one whose hash stands beside it in a bag.
 
-A definition that lies makes wrong numbers of sound bytes: two fields that have changed places, an integer read as a
+A wrong definition decodes sound bytes to wrong numbers: two fields that have changed places, an integer read as a
 float. Where the recorder wrote down the hash of the type that it saw on DDS, such a lie shows.
 
 Source: ROS 2's REP-2016, RIHS01: SHA-256 over names and types of the fields, and of those of all types in them.

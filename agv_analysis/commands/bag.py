@@ -1,4 +1,4 @@
-"""`agv-ncs bag`: what is in a recording, what is wrong with it, and how to get it out."""
+"""`agv-ncs bag`: what is in a recording, what is wrong with it, and export and recovery."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LONG = 2**28
 
 @click.group("bag")
 def command() -> None:
-    """Look into a recording, export it, or recover what is whole in a damaged one.
+    """Inspect a recording, export it, or recover the intact messages of a damaged one.
 
     A BAG is a rosbag2 directory or a bare .mcap or .db3 file.
     """
@@ -30,7 +30,7 @@ def command() -> None:
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 def info(bag: Path, json_file: Path | None) -> None:
-    """Say what BAG holds, and everything that is wrong with it.
+    """Show what BAG holds, and everything that is wrong with it.
 
     Reads and decodes every message. The exit status is 1 only if nothing can be read.
 
@@ -69,7 +69,7 @@ def export(bag: Path, form: str | None, topics: tuple[str, ...], out: Path | Non
     from agv_analysis.bags.export import EXPORTS
 
     if form is None:
-        raise click.UsageError(f"say in which form: {', '.join(f'--{name}' for name in EXPORTS)}")
+        raise click.UsageError(f"choose a format: {', '.join(f'--{name}' for name in EXPORTS)}")
     content = _read(bag, topics)
     where = out or bag.with_name(f"{bag.name}_{form}" if form != "npz" else f"{bag.name}.npz")
     for path in EXPORTS[form](content, where):
@@ -92,7 +92,7 @@ def _read(bag: Path, topics: tuple[str, ...]) -> Bag:
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
 def recover(bag: Path, out: Path) -> None:
-    """Write everything that is whole in BAG to a clean bag OUT, and say what is missing.
+    """Write every intact message of BAG to a clean bag OUT, and report what is missing.
 
     OUT becomes an MCAP file if its name ends in .mcap, else a rosbag2 directory.
 

@@ -1,4 +1,4 @@
-"""`agv-ncs channel`: what a channel does, before anyone drives through it."""
+"""`agv-ncs channel`: what a channel does to its messages."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 @with_settings
 @click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose channel.")
 @click.option(
-    "--slots", type=click.IntRange(1, 10_000_000), default=100_000, show_default=True, help="How many slots to look at."
+    "--slots", type=click.IntRange(1, 10_000_000), default=100_000, show_default=True, help="Number of slots."
 )
-@click.option("--fit", metavar="TRACE", help="Look at the model that fits this trace, instead of the file's channel.")
-@click.option("--from-netem", metavar="LINE", help='Look at netem\'s channel, as in "loss gemodel 2% 20% 100% 0%".')
+@click.option("--fit", metavar="TRACE", help="Use the model that fits this trace, instead of the file's channel.")
+@click.option("--from-netem", metavar="LINE", help='Use netem\'s channel, as in "loss gemodel 2% 20% 100% 0%".')
 @click.option("--netem", is_flag=True, help="Print the channel as an option of `tc qdisc ... netem`, and nothing else.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the distribution of n_ul to this file.")
@@ -38,7 +38,7 @@ def command(
     csv_file: Path | None,
     picture: Path | None,
 ) -> None:
-    """Say what a channel of the params file PARAMS does to its messages, beside what theory expects.
+    """Show what a channel of the params file PARAMS does to its messages, beside theory.
 
     The slots are those that a run with the file's seed meets; where it matters, with the AGV on its reference.
 
@@ -118,7 +118,7 @@ def setting(found: ChannelStudy) -> str:
 
 
 def rows(found: ChannelStudy) -> Iterator[tuple[str, str, str]]:
-    """Name, what the slots give and what theory expects, as text; the last is a dash where nothing is known."""
+    """Name, measured and expected value, as text; the last is a dash where nothing is known."""
     outages, theory = found.outages, found.expected
 
     def pair(name: str, measured: float, expected: float | None, unit: str) -> tuple[str, str, str]:

@@ -1,4 +1,4 @@
-"""`agv-ncs explore`: a page on this machine for questions that begin with what if."""
+"""`agv-ncs explore`: a page on this machine on which settings are moved."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from agv_analysis.commands import with_settings
 @click.command("explore")
 @with_settings
 @click.option("--port", type=click.IntRange(0, 65535), default=8050, show_default=True, help="0: any free one.")
-@click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+@click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
 def command(params: str, settings: tuple[str, ...], port: int, no_browser: bool) -> None:
     """Explore the params file PARAMS in the browser: every move of a slider simulates the lap again. Ctrl-C stops it.
 
@@ -23,7 +23,7 @@ def command(params: str, settings: tuple[str, ...], port: int, no_browser: bool)
     from agv_analysis.scenario import load_scenario
 
     def ready(address: str) -> None:
-        click.echo(f"explore: {address} (Ctrl-C ends it)")
+        click.echo(f"explore: {address} (Ctrl-C stops it)")
         if not no_browser:
             import webbrowser
 

@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--lockstep", is_flag=True, help="On DDS, each slot as soon as the one before is answered.")
 @click.option("--rate", type=click.FloatRange(min=0.0, min_open=True), help="On DDS, R times as fast as recorded.")
-@click.option("--edge", type=click.Choice(["own", "running"]), default="own", help="On DDS, whose nodes answer.")
+@click.option("--edge", type=click.Choice(["own", "running"]), default="own", help="On DDS, which nodes answer.")
 @click.option("--bag", "out", type=click.Path(path_type=Path), help="Record the replay to this directory.")
-@click.option("--compare", is_flag=True, help="Hold errors and commands against the recorded; exit status 1 if not.")
-@click.option("--again", is_flag=True, help="Drive again under the recorded outages; both runs in one table.")
+@click.option(
+    "--compare", is_flag=True, help="Compare errors and commands with the recorded; exit status 1 if different."
+)
+@click.option("--again", is_flag=True, help="Repeat the run under the recorded outages; both runs in one table.")
 @click.option("--ros", is_flag=True, help="With --again: on DDS instead of simulated.")
-@click.option("--outages", type=click.Path(path_type=Path), help="Write the verdicts to this CSV file.")
-@click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose verdicts.")
+@click.option("--outages", type=click.Path(path_type=Path), help="Write the outcomes of the slots to this CSV file.")
+@click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose outcomes.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the result to this file, too.")
 @click.option("--config", type=click.Path(path_type=Path), help="The params file to use instead of the bag's own.")
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter.")
@@ -36,7 +38,7 @@ def command(
     outages: Path | None, link: str, json_file: Path | None, config: Path | None, settings: tuple[str, ...],
     namespace: str | None,
 ) -> None:  # fmt: skip
-    """Play the recording BAG to the edge's nodes or functions again, or drive again under its outages.
+    """Play the recording BAG to the edge's nodes or functions again, or repeat the run under its outages.
 
     \b
     Examples:

@@ -66,7 +66,7 @@ Causes are those of losses, gains those of the channel [dB], nan where it has no
 
 
 def _reasons(run: Run) -> Iterator[NDArray[Any]]:
-    """The columns that come of what a run knows of its links."""
+    """The columns of a run's links."""
     assert run.n_dl is not None
     yield run.n_dl
     for link in (run.uplink, run.downlink):

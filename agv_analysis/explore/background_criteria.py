@@ -18,7 +18,7 @@ from agv_ros.errors import UserError
 R = TypeVar("R")
 
 _NICE = 19
-"""What is computed beside gives way to the page and to the browser."""
+"""Background computations yield to the page and to the browser."""
 
 
 def lap_beside(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:

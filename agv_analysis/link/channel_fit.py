@@ -20,7 +20,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.metrics.confidence import clopper_pearson
 
 SIGNIFICANCE = 0.01
-"""Independent losses are given up where outcomes as bursty as these would be rarer than this under them."""
+"""Independent losses are rejected where outcomes this bursty would be rarer than this under them."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class ChannelFit:
-    """Both models as fitted, and which of them the outcomes speak for."""
+    """Both models as fitted, and which of them the outcomes support."""
 
     loss_rate: Estimate
     """p of independent losses; its interval holds for these alone, bursts make the true one wider."""
@@ -52,7 +52,7 @@ class ChannelFit:
 
     @property
     def model(self) -> str:
-        """The simplest model that the outcomes do not speak against: perfect, bernoulli or gilbert_elliott."""
+        """The simplest model that the outcomes do not reject: perfect, bernoulli or gilbert_elliott."""
         if self.loss_rate.value == 0.0:
             return "perfect"
         return "gilbert_elliott" if self.p_value is not None and self.p_value < SIGNIFICANCE else "bernoulli"

@@ -1,4 +1,4 @@
-"""What a channel does, before anyone drives through it: losses, bursts and ages, beside their closed form.
+"""What a channel does to its messages, without a loop: losses, bursts and ages, beside their closed form.
 
 For a channel that is a Markov chain (T, g), with D = diag(1 - g) and pi the stationary distribution, the last j slots
 are all lost with probability P(n_ul >= j) = pi D (T D)^(j-1) 1; the age's distribution follows by differences.

@@ -18,7 +18,7 @@ WIDTH = 3.5
 STYLE: Any = {
     "font.size": 8.0,
     "axes.linewidth": 0.6,
-    "pdf.fonttype": 42,  # TrueType, whole: what journals ask for
+    "pdf.fonttype": 42,  # TrueType, embedded: what journals require
     "svg.fonttype": "path",  # letters as paths: no font is missing anywhere
     "svg.hashsalt": "agv_ncs",  # the same bytes for the same run
 }

@@ -1,7 +1,7 @@
 """The report: one HTML file that needs no network, the verdict first.
 
-Every string goes through the template's escaping, and what goes into a script is JSON in which no `<` is left. The
-page's own policy forbids it to load anything.
+Every string goes through the template's escaping, and what goes into a script is JSON without any `<`. The page's
+content security policy forbids loading anything.
 """
 
 from __future__ import annotations

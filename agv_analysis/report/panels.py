@@ -64,7 +64,7 @@ class Panel:
     lines: tuple[Line, ...]
     log: bool = False
     equal: bool = False
-    """Is a metre (or a unit) as long up as across?"""
+    """Have both axes the same scale?"""
     y_range: tuple[float, float] | None = None
     """What is shown at first; None: everything."""
 

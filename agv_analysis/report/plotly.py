@@ -33,7 +33,7 @@ MOST_POINTS = 20_000
 """Points of one line in a report; longer runs are thinned."""
 
 MOST_DOTS = 5000
-"""Of points that are drawn by themselves: each is an element of the page, and costs as much as many of a line."""
+"""Single points: each is an element of the page, and costs as much as many points of a line."""
 
 _LONGEST_CAUSE = 60
 """Letters of a cause that are shown, at most."""

@@ -38,7 +38,7 @@ def sentence(analysis: Observations) -> str:
 
 
 def _is_late(analysis: Observations) -> bool:
-    """Were poses older than outages make them? Messages were delayed, then."""
+    """Were poses older than outages explain, because messages were delayed?"""
     return analysis.n > analysis.outages.uplink.longest
 
 

@@ -1,4 +1,4 @@
-"""A claim: where it stands, how it is measured, how it is judged; and what came out."""
+"""A claim: where it stands, how it is measured and judged, and the result."""
 
 from __future__ import annotations
 

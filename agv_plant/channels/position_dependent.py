@@ -1,6 +1,6 @@
 """Channels whose losses depend on where the AGV is when the message is sent.
 
-What such a model needs to know of the floor, holes or waves, is a table of floats, made once for a run; an outcome is a
+What such a model knows about the floor, holes or waves, is a table of floats, made once for a run; an outcome is a
 scalar function of that table, of two levels that may change while it runs, of the slot's uniform random number and of
 the place. The relay knows the place from the poses that it passes on; the downlink takes the one that it saw last.
 """
@@ -13,7 +13,7 @@ from agv_plant.channels.coverage_hole import Table, coverage_hole, is_in_hole
 from agv_plant.channels.rayleigh import fading_gain, rayleigh
 
 NOWHERE = (math.nan, math.nan)
-"""The place of an AGV that has not been heard of: in no hole, in no fade."""
+"""The place of an AGV whose pose is unknown: in no hole, in no fade."""
 
 EVERYWHERE, COVERAGE_HOLE, RAYLEIGH = range(3)
 

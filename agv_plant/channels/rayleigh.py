@@ -1,4 +1,4 @@
-"""Fading: waves from all sides add up or cancel out, and which of both depends on the place.
+"""Fading: waves from all sides add up or cancel, depending on the place.
 
 The channel's gain is a field over the floor, fixed by the seed: a sum of plane waves, each from a direction of its own,
 

@@ -66,7 +66,7 @@ def _in_blocks(make: Callable[[int, int], NDArray[np.float64]]) -> InBlocks[list
 
 
 class _SharedUplinkModel:
-    """The uplink that a fleet shares, as a model that is asked for each slot in turn."""
+    """The uplink that a fleet shares, as a model that is evaluated slot by slot."""
 
     def __init__(self, parameters: ChannelParameters, seed: int, link: str) -> None:
         self._scheduler = SCHEDULERS.index(parameters.scheduler)
@@ -94,7 +94,7 @@ class Channel:
     """Outcomes of one channel, a pure function of (parameters, seed, stream name, k) and, for some, of the place.
 
     The state of a channel with memory is kept for the next slot only; asking for an earlier slot starts again at slot
-    0, so any order of questions has the same answers. New parameters hold from the slot after the last one asked for.
+    0, so outcomes do not depend on the order of calls. New parameters hold from the slot after the last evaluated one.
     A measured channel's file is read here, once. Raises TraceError if it cannot be used, ChannelError for a model of
     another package that cannot be loaded.
     """
@@ -131,7 +131,7 @@ class Channel:
         return self.outcome(k, x, y).lost
 
     def outcome(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> SlotOutcome:
-        """The outcome on the message of slot `k`. Slot 0 is never lost: a run begins with the AGV known to the edge."""
+        """The outcome of slot `k`. Slot 0 is never lost: a run begins with the AGV known to the edge."""
         outcome = self._by_place(k, x, y) if self._kind else self._by_slot(k)
         if k == 0:
             return outcome._replace(lost=False, cause="")

@@ -1,4 +1,4 @@
-"""What a channel's parameters come to before a run: its parts between changes, what its model knows of the floor."""
+"""A channel prepared for a run: its segments between changes, and its model's table of the floor."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _with(channel: ChannelParameters, name: str, value: float) -> ChannelParamet
 
 
 def spatial_table_of(channel: ChannelParameters, seed: int, stream: str) -> list[list[float]]:
-    """What the channel's model needs to know of the floor: rows of five numbers.
+    """The table of the floor of a channel's model: rows of five numbers.
 
     `correlation` is the coefficient of correlation between the complex gains of a fading downlink and uplink.
     """

@@ -17,7 +17,7 @@ EXPIRED = "expired"
 """Cause of a loss: the message would have come, but older than its lifetime."""
 
 _ROUNDING = 1e-9
-"""Slots by which a delay may exceed whole ones: 0.015 s are more than three slots of 0.005 s to a computer."""
+"""Slots by which a delay may exceed whole ones: 0.015 s are more than three slots of 0.005 s in floating point."""
 
 
 def delay_in_slots(u: float, delay: float, jitter: float, ts: float) -> float:

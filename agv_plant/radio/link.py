@@ -15,7 +15,7 @@ from agv_ros.stamps import Grid, NearestSteps, Steps
 
 
 class Passage(NamedTuple):
-    """What a slot of the link brings: the outcome on its message, and the messages that arrive in it, in order."""
+    """Result of a slot of the link: its outcome, and the messages that arrive in it, in order."""
 
     slot: Slot
     arrived: list[bytes]

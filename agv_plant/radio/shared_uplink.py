@@ -1,4 +1,4 @@
-"""One uplink for a whole fleet: a few resource blocks a slot, and a scheduler that says whose pose goes.
+"""One uplink for a whole fleet: a few resource blocks a slot, and a scheduler that chooses which poses are sent.
 
 In every slot each of N vehicles has a new pose to send, and `blocks` of them may. A pose that is not sent is lost, for
 the next one is newer; one that is sent is lost with probability p, independently. The schedulers:

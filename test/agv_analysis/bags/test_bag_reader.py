@@ -205,7 +205,7 @@ def test_what_is_not_checked_is_said(tmp_path: Path) -> None:
     unchecked = f"not checked, because there is no CRC: metadata records: 1, messages outside of chunks: {3 * COUNT}"
     assert unchecked in read_bag(path).problems
     write_mcap(path, **VARIANTS["without summary"])
-    assert "file without statistics, in which a missing message would not be noticed: 1" in read_bag(path).problems
+    assert "file without statistics, in which a missing message would go undetected: 1" in read_bag(path).problems
 
 
 def test_metadata_and_qos(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ def test_parquet_is_exact(tmp_path: Path) -> None:
 
 
 def test_export_refuses_what_it_cannot_do(tmp_path: Path) -> None:
-    assert "say in which form: --csv, --parquet, --npz" in agv_ncs("bag", "export", SAMPLE).stderr
+    assert "choose a format: --csv, --parquet, --npz" in agv_ncs("bag", "export", SAMPLE).stderr
     missing = agv_ncs("bag", "export", SAMPLE, "--csv", "--topic", "/nowhere", "--out", tmp_path / "out")
     assert missing.exit_code == 1
     assert "no topic /nowhere; it has /agv/cmd_vel" in missing.stderr
