@@ -347,9 +347,7 @@ class McapFile:
             except DamagedError as error:
                 self._damages += 1
                 if self._damages > _MAX_DAMAGES:
-                    self.findings.add(
-                        "rest of a file with too much damage, not read", at=position, is_loss=True
-                    )
+                    self.findings.add("rest of a file with too much damage, not read", at=position, is_loss=True)
                     return
                 item, position = self._pass_over(position, str(error))
             if item is not None:

@@ -31,9 +31,7 @@ PITCH = 20.0
     metavar="N",
     help="N loops, in the namespaces agv_01, agv_02, ..., that share one uplink; each records to BAG/agv_01, ...",
 )
-@click.option(
-    "--pitch", type=float, default=PITCH, show_default=True, help="Fleet: distance between tracks [m]."
-)
+@click.option("--pitch", type=float, default=PITCH, show_default=True, help="Fleet: distance between tracks [m].")
 def command(
     params: str,
     settings: tuple[str, ...],
