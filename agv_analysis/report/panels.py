@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.metrics.convergence import TOLERANCE, body_errors, wrapped
+from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.run import Floats, Run
-from agv_analysis.stability import lifted, paper
 from agv_analysis.stability.analysis import Analysis, Observations
-from agv_analysis.stability.criteria.paper_test import applies_to, paper_inputs
-from agv_analysis.stability.scenario_loop import loop_of_run
 
 TIME = "time [s]"
 
@@ -25,11 +23,6 @@ REFERENCE, DRIVEN, LOST, OTHER, LIMIT = "reference", "driven", "lost", "other", 
 
 SMALLEST = 1e-6
 """Errors [m] below this are drawn at it: a logarithm has no zero."""
-
-LARGEST_LIFTED = 600
-"""Multipliers of a larger lifted system are not computed: 3 (n + 1) of them take its cube in time."""
-
-_EIGENVALUE_STEPS = 400
 
 
 class Slots(NamedTuple):
@@ -189,26 +182,6 @@ def unit_circle(analysis: Analysis) -> Panel:
     )
     title = f"Eigenvalues: the paper's along the run, the lifted system's for a pose always {analysis.n} steps old"
     return Panel("eigenvalues", title, "Re", "Im", lines, equal=True)
-
-
-def paper_eigenvalues(run: Run) -> NDArray[np.complex128]:
-    """Eigenvalues of A(k) (eq. 55) at up to 400 steps of a run, evenly spread, shape (M,); none where it diverged."""
-    if not applies_to(run.scenario):
-        return np.empty(0, dtype=np.complex128)
-    some = np.unique(np.linspace(0, len(run) - 1, _EIGENVALUE_STEPS).astype(np.int64))
-    theta, theta_held, v_held = (values[some] for values in paper_inputs(run))
-    matrices = paper.matrices(theta, theta_held, v_held, run.scenario.controller, run.ts)
-    usable = np.isfinite(matrices).all(axis=(1, 2))
-    return np.asarray(np.linalg.eigvals(matrices[usable]).ravel(), dtype=np.complex128)
-
-
-def lifted_multipliers(analysis: Analysis) -> NDArray[np.complex128]:
-    """Eigenvalues of the lifted system at the speeds where it is worst, shape (m + q n,); none if it is too large."""
-    loop, n = loop_of_run(analysis.run), analysis.n
-    if loop.size + loop.outputs * n > LARGEST_LIFTED:
-        return np.empty(0, dtype=np.complex128)
-    companion = lifted.companion(loop.frozen(lifted.worst_step(loop, n)), n)
-    return np.asarray(np.linalg.eigvals(companion), dtype=np.complex128)
 
 
 def thinned(line: Line, most: int) -> Line:

@@ -16,9 +16,10 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.report.matplotlib_figures import draw_figures
 from agv_analysis.report.page import render, write_report
-from agv_analysis.report.panels import LINE, Line, lifted_multipliers, panels, paper_eigenvalues, thinned, track
+from agv_analysis.report.panels import LINE, Line, panels, thinned, track
 from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario
