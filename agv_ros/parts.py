@@ -364,7 +364,8 @@ def try_part(part: Part, call: Call, *arguments: Any) -> None:
     if _shape(found) != _expected_shape(part, call):
         raise PartError(f"{part.where} must return numbers, a tuple of {', '.join(words)}; got {_short(found)}")
     if not all(math.isfinite(x) for x in _flat(found)):
-        given = ", ".join(f"{name} = {_short(value)}" for name, value in zip(call.required, arguments, strict=False))
+        named = dict(zip(call.arguments.split(", "), arguments, strict=True))
+        given = ", ".join(f"{name} = {_short(named[name])}" for name in call.required)
         raise PartError(f"{part.where} must return finite numbers, got {_short(found)} for {given}")
 
 

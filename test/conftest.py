@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 import socket
@@ -184,6 +185,42 @@ def start() -> Iterator[Start]:
 def agv_ncs(start: Start) -> Callable[..., tuple[int, str]]:
     """Run a command of `agv-ncs` to its end: exit status and output."""
     return lambda *arguments, **options: start("agv_analysis.cli", *map(str, arguments), **options).end(300.0)
+
+
+Install = Callable[..., dict[str, str]]
+
+
+@pytest.fixture(scope="session")
+def install() -> Install:
+    """Put a package into a folder as pip would; gives the environment of processes that have it.
+
+    `modules` are sources by name, `points` the entry points by group, each a name and what it names.
+    """
+
+    def into(folder: Path, modules: dict[str, str], points: dict[str, dict[str, str]], name: str = "foreign") -> Any:
+        information = folder / f"{name}-1.0.dist-info"
+        information.mkdir(parents=True)
+        for module, code in modules.items():
+            (folder / f"{module}.py").write_text(code, encoding="utf-8")
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        groups = (f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in named.items()) for group, named in points.items())
+        (information / "entry_points.txt").write_text("\n".join(groups), encoding="utf-8")
+        return {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{REPOSITORY}", "COLUMNS": "200"}
+
+    return into
+
+
+@pytest.fixture(scope="session")
+def page_block() -> Callable[[str, str], str]:
+    """The code between two marks of a page of docs/."""
+
+    def block(page: str, mark: str) -> str:
+        text = (REPOSITORY / "docs" / page).read_text(encoding="utf-8")
+        found = re.search(rf"<!-- {mark}:begin -->\n```\w+\n(.*?)```\n<!-- {mark}:end -->", text, re.DOTALL)
+        assert found, f"{page} has no block {mark}"
+        return found.group(1)
+
+    return block
 
 
 @pytest.fixture(scope="session")

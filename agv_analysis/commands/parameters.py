@@ -15,16 +15,25 @@ def command() -> None:
 
 
 def markdown() -> str:
-    """The parameters of all nodes as tables in Markdown, one for each node."""
+    """The parameters of all nodes as tables in Markdown, one for each node and for each part that it may choose."""
     from agv_analysis.runtime.parameters import RecorderParameters
-    from agv_analysis.scenario import SCHEMAS
+    from agv_analysis.scenario import PART_CHOICES, SCHEMAS
     from agv_ros.parameters import SHARED, parameters_of
 
     schemas = {**SCHEMAS, "recorder": RecorderParameters}
     shared = [parameters_of(schemas["plant"])[name] for name in SHARED]
     text = _table("All nodes", shared)
     for node, schema in schemas.items():
-        text += "\n" + _table(f"`{node}`", [p for p in parameters_of(schema).values() if p.name not in SHARED])
+        known, tables = parameters_of(schema), {}
+        if node in PART_CHOICES:
+            choice = PART_CHOICES[node]
+            tables = {part.where: choice.names(part.name) for part in choice.registry.usable().values()}
+        others = {*SHARED, *(name for names in tables.values() for name in names)}
+        text += "\n" + _table(f"`{node}`", [found for found in known.values() if found.name not in others])
+        for where, names in tables.items():
+            found = [known[name] for name in names if name in known]
+            if found:
+                text += "\n" + _table(f"`{node}`, {where}", found)
     return text
 
 
