@@ -281,6 +281,31 @@ assert parse_scenario(scenario.to_yaml(of_all_parts=True), "again") == scenario
 """
 
 
+EXPLORE = """
+import sys
+from agv_analysis.explore.response import respond
+from agv_analysis.explore.settings import scenario_of, values_of
+from agv_analysis.explore.sliders import CHOICES, GAIN_SLIDERS, LOOKING_AHEAD
+from agv_analysis.scenario import load_scenario
+assert {"integral", "aim"} <= set(CHOICES["law"].names)
+assert {"tug"} < set(CHOICES["vehicle"].names) and {"coast"} < set(CHOICES["policy"].names)
+assert "stall" in CHOICES["model"].names and "aim" in LOOKING_AHEAD
+for slider in GAIN_SLIDERS["integral"]:
+    print(slider.label, slider.low, slider.high)
+base = load_scenario(sys.argv[1], ["plant.duration=2.0"])
+chosen = {"law": "aim", "vehicle": "tug", "policy": "coast", "aim-k": 3.0, "look_ahead": 400}
+scenario = scenario_of(base, {**values_of(base), **chosen})
+assert scenario.controller.gains == (3.0,) and scenario.plant.look_ahead == 0.4
+assert respond(scenario).rows[0][0] == "Error in the last tenth"
+"""
+
+
+def test_the_explorer_offers_them(package: dict[str, str]) -> None:
+    assert python(package, "-c", EXPLORE, PAPER).splitlines() == [
+        "kx [1/s] 0.0 32.0", "ki [1/s^2] 0.0 16.0", "ky [1/m^2] 0.0 4.0", "ktheta [1/m] 0.0 8.0",
+    ]  # fmt: skip
+
+
 def test_a_params_file_holds_the_parameters_of_the_parts_chosen(package: dict[str, str]) -> None:
     text = python(package, "-c", ROUND_TRIP, PAPER, *ALL.settings)
     for name in ("integral.ki: 4.0", "tug.rate_lag: 0.03", "coast.share: 0.9", "law: integral"):

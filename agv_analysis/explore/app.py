@@ -9,7 +9,16 @@ from typing import Any
 
 from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside
 from agv_analysis.explore.response import respond
-from agv_analysis.explore.settings import CHOICES, PRESETS, SLIDERS, preset_values, scenario_of, values_of
+from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, values_of
+from agv_analysis.explore.sliders import (
+    CHOICES,
+    GAIN_SLIDERS,
+    LOOK_AHEAD,
+    LOOKING_AHEAD,
+    OTHER_SLIDERS,
+    SLIDERS,
+    Slider,
+)
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -76,10 +85,16 @@ def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
     controls = [html.H1("What if?")]
     controls += [html.Button(preset.title, id=f"preset-{key}") for key, preset in PRESETS.items()]
     controls.append(html.P("", id="story"))
-    for key, (label, names) in CHOICES.items():
-        controls += [html.Label(label), dcc.Dropdown(list(names), at_first[key], id=key, clearable=False)]
-    for slider in SLIDERS:
-        controls += [html.Label(slider.label), _slider(dcc, slider, at_first[slider.key])]
+    for key, choice in CHOICES.items():
+        controls += [html.Label(choice.label), dcc.Dropdown(list(choice.names), at_first[key], id=key, clearable=False)]
+
+    def of(sliders: tuple[Slider, ...]) -> list[Any]:
+        return [part for one in sliders for part in (html.Label(one.label), _slider(dcc, one, at_first[one.key]))]
+
+    styles = dict(zip(SHOWN_FOR_A_LAW, _styles(at_first["law"]), strict=True))
+    sliders_of_groups = {**{_group(law): sliders for law, sliders in GAIN_SLIDERS.items()}, _AHEAD: (LOOK_AHEAD,)}
+    controls += [html.Div(of(sliders), id=key, style=styles[key]) for key, sliders in sliders_of_groups.items()]
+    controls += of(OTHER_SLIDERS)
     example = "further settings, one a line:\nplant.duration=50.0\nrelay.downlink.model=bernoulli"
     controls += [html.Label("more"), dcc.Textarea(id="more", value="", placeholder=example, rows=3)]
     shown = [
@@ -104,7 +119,24 @@ def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
     return html.Main([html.Div(controls, id="controls"), html.Div(shown, id="shown")])
 
 
-def _slider(dcc: Any, slider: Any, value: float) -> Any:
+def _group(law: str) -> str:
+    """Id of what holds the sliders of a law's gains."""
+    return f"gains-of-{law}"
+
+
+_AHEAD = "sliders-ahead"
+
+SHOWN_FOR_A_LAW = (*map(_group, GAIN_SLIDERS), _AHEAD)
+"""Ids of what is shown for some laws only."""
+
+
+def _styles(law: str) -> list[dict[str, str]]:
+    """Whether each of SHOWN_FOR_A_LAW is, where a law is chosen."""
+    shown = [*(name == law for name in GAIN_SLIDERS), law in LOOKING_AHEAD]
+    return [{} if is_shown else {"display": "none"} for is_shown in shown]
+
+
+def _slider(dcc: Any, slider: Slider, value: float) -> Any:
     ends = {end: f"{end:g}" for end in (slider.low, slider.high)}
     return dcc.Slider(slider.low, slider.high, slider.step, value=value, marks=ends, id=slider.key, updatemode="drag")
 
@@ -129,6 +161,10 @@ def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
         except UserError as error:
             return dash.no_update, dash.no_update, dash.no_update, str(error), "old"
         return found.track, found.time, _table(dash.html, found.rows), "", "old"
+
+    @app.callback(*(Output(key, "style") for key in SHOWN_FOR_A_LAW), Input("law", "value"), prevent_initial_call=True)
+    def show(law: str) -> Any:
+        return _styles(law)
 
     @app.callback(
         Output("lap", "children"), Output("lap", "className", allow_duplicate=True),

@@ -8,49 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agv_analysis.scenario import Scenario
-from agv_cloud.reference.tracks import TRACKS
-from agv_cloud.staleness.registry import STALENESS_POLICIES
-from agv_plant.channels import MODELS
+from agv_analysis.explore.sliders import CHOICES, LOOK_AHEAD, LOOKING_AHEAD, SLIDERS, USUAL_LOOK_AHEAD
+from agv_analysis.scenario import PART_CHOICES, SCHEMAS, Scenario
 from agv_plant.parameters import PlantParameters, RelayParameters
+from agv_plant.vehicle.registry import VEHICLES
 from agv_ros.parameters import LoopParameters, as_dict
-
-
-@dataclass(frozen=True)
-class Slider:
-    """One slider: what it is called, which values it takes."""
-
-    key: str
-    label: str
-    low: float
-    high: float
-    step: float
-
-
-NO_LIMIT = 20.0
-"""At this end of its slider v_max is no limit."""
-
-SLIDERS = (
-    Slider("kx", "K_x [1/s]", 0.0, 400.0, 1.0),
-    Slider("ky", "K_y [1/m^2]", 0.0, 20.0, 0.1),
-    Slider("ktheta", "K_theta [1/m]", 0.0, 20.0, 0.1),
-    Slider("ts", "T_s [ms]", 1.0, 50.0, 1.0),
-    Slider("v_max", f"v_max [m/s], {NO_LIMIT:g}: none", 0.5, NO_LIMIT, 0.5),
-    Slider("ahead", "starts ahead by [m]", -10.0, 10.0, 0.5),
-    Slider("left", "starts to the left by [m]", -5.0, 5.0, 0.1),
-    Slider("p", "channel: p", 0.0, 1.0, 0.005),
-    Slider("r", "channel: r", 0.0, 1.0, 0.01),
-    Slider("n", "burst: n lost after each received", 0.0, 60.0, 1.0),
-    Slider("delay", "delay of each pose [ms]", 0.0, 500.0, 1.0),
-    Slider("seed", "seed of the outages", 1.0, 100.0, 1.0),
-)
-
-CHOICES = {
-    "model": ("channel", tuple(MODELS)),
-    "policy": ("policy", STALENESS_POLICIES.names()),
-    "track": ("track", tuple(TRACKS)),
-}
-"""Drop-down lists by key: label and what there is to choose from."""
 
 Values = Mapping[str, Any]
 """Value by key of each slider and list, and the text `more` of further settings, one a line."""
@@ -58,26 +20,24 @@ Values = Mapping[str, Any]
 
 def values_of(scenario: Scenario) -> dict[str, Any]:
     """Where sliders and lists stand for a scenario; beyond its end a slider stands at it."""
-    gains, up, detector = scenario.controller, scenario.relay.uplink, scenario.error_detector
-    x_r, y_r, theta = detector.track_start
+    values = {node: as_dict(getattr(scenario, node)) for node in SCHEMAS}
+    x_r, y_r, theta = scenario.error_detector.track_start
     dx, dy = scenario.plant.initial_pose[0] - x_r, scenario.plant.initial_pose[1] - y_r
     found: dict[str, Any] = {
-        "kx": gains.kx,
-        "ky": gains.ky,
-        "ktheta": gains.ktheta,
-        "ts": 1e3 * scenario.plant.ts,
-        "v_max": gains.v_max,
         "ahead": dx * math.cos(theta) + dy * math.sin(theta),
         "left": dy * math.cos(theta) - dx * math.sin(theta),
-        "p": up.p,
-        "r": up.r,
-        "n": up.n,
-        "delay": 1e3 * up.delay,
-        "seed": scenario.relay.seed,
     }
     for slider in SLIDERS:
+        if slider.target:
+            node, _, name = slider.target.partition(".")
+            found[slider.key] = slider.scale * values[node][name]
+    found[LOOK_AHEAD.key] = found[LOOK_AHEAD.key] or USUAL_LOOK_AHEAD
+    for slider in SLIDERS:
         found[slider.key] = round(min(slider.high, max(slider.low, found[slider.key])), 9)
-    return {**found, "model": up.model, "policy": detector.policy, "track": detector.track, "more": ""}
+    for key, choice in CHOICES.items():
+        node, _, name = choice.target.partition(".")
+        found[key] = values[node][name]
+    return {**found, "more": ""}
 
 
 def scenario_of(base: Scenario, values: Values) -> Scenario:
@@ -95,34 +55,34 @@ def settings_of(base: Scenario, values: Values) -> list[str]:
     settings = [f"{_TARGETS[key]}={_text(key, values[key])}" for key in _TARGETS if key in moved]
     if moved & {"ahead", "left"}:
         settings.append(f"plant.initial_pose={list(_initial_pose(base, values['ahead'], values['left']))}")
+    settings += _look_ahead(base, values, LOOK_AHEAD.key in moved)
     return settings + [line.strip() for line in values["more"].splitlines() if line.strip()]
 
 
-_TARGETS = {
-    "kx": "controller.kx",
-    "ky": "controller.ky",
-    "ktheta": "controller.ktheta",
-    "ts": "plant.ts",
-    "v_max": "controller.v_max",
-    "p": "relay.uplink.p",
-    "r": "relay.uplink.r",
-    "n": "relay.uplink.n",
-    "delay": "relay.uplink.delay",
-    "seed": "relay.seed",
-    "model": "relay.uplink.model",
-    "policy": "error_detector.policy",
-    "track": "error_detector.track",
-}
+def _look_ahead(base: Scenario, values: Values, moved: bool) -> list[str]:
+    """The setting that goes with the law: its slider counts where the law looks ahead, and another law does not."""
+    if values["law"] in LOOKING_AHEAD:
+        wanted = values[LOOK_AHEAD.key] / LOOK_AHEAD.scale
+        return [f"{LOOK_AHEAD.target}={_literal(wanted)}"] if moved or base.controller.steps_ahead == 0 else []
+    drops = values["law"] != base.controller.law and base.controller.look_ahead > 0.0
+    return [f"{LOOK_AHEAD.target}=0.0"] if drops else []
+
+
+_TARGETS = {slider.key: slider.target for slider in SLIDERS if slider.target and slider is not LOOK_AHEAD}
+_TARGETS |= {key: choice.target for key, choice in CHOICES.items()}
+
+_BY_KEY = {slider.key: slider for slider in SLIDERS}
 
 
 def _text(key: str, value: Any) -> str:
     if key in CHOICES:
         return str(value)
+    slider = _BY_KEY[key]
     if key in ("n", "seed"):
         return _literal(round(value))
-    if key == "v_max" and value >= NO_LIMIT:
+    if slider.open_end and value >= slider.high:
         return _literal(math.inf)
-    return _literal(float(value) / 1e3 if key in ("ts", "delay") else float(value))
+    return _literal(float(value) / slider.scale)
 
 
 def _initial_pose(base: Scenario, ahead: float, left: float) -> tuple[float, float, float]:
@@ -142,7 +102,7 @@ class Preset:
 
 _PAPERS = (
     "controller.kx=25.0", "controller.ky=1.0", "controller.ktheta=2.0", "controller.v_max=.inf", "plant.ts=0.005",
-    "relay.uplink.model=perfect",
+    "relay.uplink.model=perfect", "controller.law=kanayama", "controller.look_ahead=0.0", "plant.vehicle=unicycle",
 )  # fmt: skip
 
 _LATE = (*_PAPERS, "error_detector.track=line", "relay.uplink.delay=0.065")
@@ -178,16 +138,17 @@ def _back_to_default(base: Scenario) -> list[str]:
     """Settings that undo what a scenario says of its links and of its AGV's body, but for what is on the page."""
     changes = {"plant": as_dict(base.plant), "relay": as_dict(base.relay)}
     defaults = {"plant": as_dict(PlantParameters()), "relay": as_dict(RelayParameters())}
+    kept = {*_KEPT, *(name for vehicle in VEHICLES.usable() for name in PART_CHOICES["plant"].names(vehicle))}
     return [
         f"{node}.{name}={_literal(default)}"
         for node, values in defaults.items()
         for name, default in values.items()
-        if changes[node][name] != default and f"{node}.{name}" not in _TARGETS.values() and name not in _KEPT
+        if changes[node][name] != default and f"{node}.{name}" not in _TARGETS.values() and name not in kept
     ]
 
 
 _KEPT = (*as_dict(LoopParameters()), "initial_pose", "clock", "duration", "seed")
-"""Parameters of the plant's, and of the relay's, that a preset leaves as they are."""
+"""Parameters of the plant's, and of the relay's, that a preset leaves as they are, beside those of vehicles."""
 
 
 def _literal(value: object) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import re
 import signal
@@ -22,11 +23,12 @@ import pytest
 from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside, lap_rows
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
+from agv_analysis.explore.sliders import gain_slider
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import analyse
-from agv_ros.parameters import ParameterError
+from agv_ros.parameters import Parameter, ParameterError
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
@@ -68,6 +70,43 @@ def test_what_a_slider_says_arrives_in_the_scenario(base: Scenario) -> None:
     assert (found.plant.duration, found.plant.integration) == (50.0, "arc")
     again = {key: value for key, value in values_of(found).items() if key in moved}
     assert again == pytest.approx({k: v for k, v in moved.items() if k != "track"} | {"track": "eight"})
+
+
+def test_a_slider_for_a_gain_reaches_from_its_bound_to_four_times_its_default() -> None:
+    def ends(default: float, low: float | None, high: float | None, above: float | None = None) -> tuple[float, ...]:
+        known = Parameter("k", "double", default, "1/s", "gain", low, high, above)
+        found = gain_slider("k", "controller.law.k", "k", known)
+        return found.low, found.high, found.step
+
+    assert ends(2.0, 0.0, 1e6) == (0.0, 8.0, 0.1)
+    assert ends(2.0, None, None) == (0.0, 8.0, 0.1)
+    assert ends(2.0, 1.0, 3.0) == (1.0, 3.0, 0.02)
+    assert ends(-2.0, None, None) == (-8.0, 0.0, 0.1)
+    assert ends(0.5, None, 10.0, 0.0) == (0.02, 2.0, 0.02)
+    assert ends(0.0, 0.0, 1e6) == (0.0, 1.0, 0.01)
+    assert ends(math.inf, None, math.inf, 0.0) == (0.2, 20.0, 0.2)
+    limit = Parameter("w_max", "double", math.inf, "rad/s", "limit", None, math.inf, 0.0)
+    assert gain_slider("k", "controller.law.w_max", "w_max", limit).label == "w_max [rad/s], 20: none"
+
+
+def test_what_is_set_for_a_law_goes_with_it(base: Scenario) -> None:
+    def chosen(start: Scenario = base, **moved: Any) -> Scenario:
+        return scenario_of(start, {**values_of(start), **moved})
+
+    found = chosen(law="state_feedback", **{"state_feedback-ky": 3.5, "kx": 7})
+    assert (found.controller.gains, found.controller.kx) == ((2.0, 3.5, 2.0), 7.0)
+    assert found.controller.look_ahead == 0.0
+    ahead = chosen(law="pure_pursuit")
+    assert {node.look_ahead for node in (ahead.plant, ahead.relay, ahead.controller, ahead.error_detector)} == {0.5}
+    assert chosen(law="pure_pursuit", look_ahead=200).controller.look_ahead == 0.2
+    assert settings_of(ahead, values_of(ahead)) == []
+    assert chosen(ahead, look_ahead=200).controller.look_ahead == 0.2
+    assert chosen(ahead, law="kanayama").controller.look_ahead == 0.0
+    assert chosen(vehicle="bicycle", policy="align").plant.vehicle == "bicycle"
+    for key in PRESETS:
+        other = ahead.with_settings(["plant.vehicle=bicycle"], "test")
+        shown = scenario_of(other, preset_values(other, key))
+        assert shown == scenario_of(base, preset_values(base, key))
 
 
 @pytest.mark.parametrize("more", ["controller.kx=-1.0", "plant.color=red", "relay.uplink.model=trace", "nonsense"])
@@ -267,6 +306,40 @@ def test_moving_a_slider_simulates_anew(page: Page) -> None:
     assert kx > 25.0
     page.until(lambda: f"up to {n} along" in page.text("told"))
     assert page.text("problem") == ""
+    assert complaints(page) == []
+
+
+def choose(page: Page, key: str, name: str) -> None:
+    """Take a name out of a drop-down list."""
+    page.click(key)
+    option = f"//div[contains(@class, 'dash-dropdown-content')]//label[normalize-space(.)='{name}']"
+    page.until(lambda: page.chrome.find_elements("xpath", option))
+    page.chrome.find_element("xpath", option).click()
+
+
+def test_a_law_brings_its_own_sliders(page: Page) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    def shown() -> list[str]:
+        return [key for key in SHOWN_FOR_A_LAW if page.chrome.find_element("id", key).is_displayed()]
+
+    from agv_analysis.explore.app import SHOWN_FOR_A_LAW
+
+    assert shown() == ["gains-of-kanayama"]
+    choose(page, "law", "pure_pursuit")
+    page.until(lambda: shown() == ["gains-of-pure_pursuit", "sliders-ahead"])
+    page.slider("pure_pursuit-kx").send_keys(Keys.PAGE_UP)
+    page.slider("look_ahead").send_keys(Keys.ARROW_LEFT)
+    page.until(lambda: page.slider("look_ahead").get_attribute("aria-valuenow") == "490")
+    page.click("export")
+    page.until(lambda: "law: pure_pursuit" in page.text("exported"))
+    found = parse_scenario(page.text("exported").partition("\n\n")[2], "exported")
+    assert found.controller.gains == (3.0, 0.1)
+    assert found.controller.look_ahead == 0.49
+    assert page.text("problem") == ""
+    choose(page, "law", "kanayama")
+    page.until(lambda: shown() == ["gains-of-kanayama"])
+    page.until(lambda: "Paper's test" in page.text("told") and page.text("problem") == "")
     assert complaints(page) == []
 
 
