@@ -22,7 +22,8 @@ def state_feedback(
         v = v_r + k_x x_e
         w = w_r + k_y y_e + k_theta theta_e
 
-    theta_e [rad] counts turns. While v_r = 0 it cannot bring the AGV back across the track, and turns it all the same.
+    theta_e [rad] counts turns. While v_r = 0 it cannot bring the AGV back across the track, and turns it all the same;
+    with k_y > 0 it is unstable behind a reference that drives backwards.
     Source: the linear design of Canudas de Wit et al., Theory of Robot Control, 1996, 9.4.1, with constant gains.
     """
     return v_r + kx * x_e, w_r + ky * y_e + ktheta * theta_e

@@ -93,7 +93,7 @@ def test_what_is_set_for_a_law_goes_with_it(base: Scenario) -> None:
     def chosen(start: Scenario = base, **moved: Any) -> Scenario:
         return scenario_of(start, {**values_of(start), **moved})
 
-    found = chosen(law="state_feedback", **{"state_feedback-ky": 3.5, "kx": 7})
+    found = scenario_of(base, {**values_of(base), "law": "state_feedback", "state_feedback-ky": 3.5, "kx": 7})
     assert (found.controller.gains, found.controller.kx) == ((2.0, 3.5, 2.0), 7.0)
     assert found.controller.look_ahead == 0.0
     ahead = chosen(law="pure_pursuit")
