@@ -17,9 +17,9 @@ setup(
     maintainer_email="agv_ncs@example.org",
     license="Apache-2.0",
     python_requires=">=3.10",
-    packages=find_packages(include=["agv_ros*", "agv_plant*", "agv_cloud*", "agv_analysis*"]),
+    packages=find_packages(include=["agv_ros*", "agv_plant*", "agv_cloud*", "agv_analysis*", "agv_ncs*"]),
     package_data={
-        **{package: ["py.typed"] for package in ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")},
+        **{package: ["py.typed"] for package in ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs")},
         "agv_analysis.report": ["*.j2"],
     },
     data_files=[

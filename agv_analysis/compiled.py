@@ -21,6 +21,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agv_ros.substitution import Function, Replacements, calls_of, functions_in, named_by, plain, replaced, with_globals
 
 HAS_NUMBA = importlib.util.find_spec("numba") is not None
@@ -76,11 +78,12 @@ def _compile(
 
 
 def _cache_folder(function: Function, replacements: Replacements) -> Path | None:
-    """Folder for the compiled function, made if need be; None if it cannot be, or for a closure.
+    """Folder for the compiled function, made if need be; None if it cannot be, or if nothing is to be kept.
 
-    A closure is known to numba's cache by what it encloses, which is another object in every process.
+    A closure is known to numba's cache by what it encloses, which is another object in every process. A function that
+    was typed into an interpreter or a notebook has no file, whose bytes would tell it from what it was before.
     """
-    if plain(function).__closure__:
+    if plain(function).__closure__ or not all(map(_has_source, functions_in(function, replacements))):
         return None
     try:
         folder = _cache_base() / _digest(function, replacements)
@@ -88,6 +91,12 @@ def _cache_folder(function: Function, replacements: Replacements) -> Path | None
     except (OSError, RuntimeError):  # Path.home() may not exist
         return None
     return folder if os.access(folder, os.W_OK) else None
+
+
+def _has_source(function: Function) -> bool:
+    """Has a function a file, or, if it was made from a text, this text as its documentation?"""
+    name = plain(function).__code__.co_filename
+    return Path(name).is_file() or (name.startswith("<") and "def " in (function.__doc__ or ""))
 
 
 def _cache_base() -> Path:
@@ -101,7 +110,16 @@ def _digest(function: Function, replacements: Replacements) -> str:
     for part in functions_in(function, replacements):
         source = Path(plain(part).__code__.co_filename)
         digest.update(source.read_bytes() if source.is_file() else (part.__doc__ or "").encode())
-        digest.update(plain(part).__code__.co_code)  # which tells apart functions of one file
-        constants = {name: value for name, value in named_by(part) if isinstance(value, (bool, int, float, str))}
-        digest.update(repr(sorted(constants.items())).encode())
+        code = plain(part).__code__  # which tells apart functions of one file
+        constants = {name: value for name, value in named_by(part) if _is_constant(value)}
+        written = [value for value in code.co_consts if _is_constant(value)]
+        digest.update(code.co_code + repr((written, sorted(constants.items()))).encode())
+        for name, value in sorted(named_by(part), key=lambda named: named[0]):
+            if isinstance(value, np.ndarray):
+                digest.update(f"{name} {value.dtype} {value.shape}".encode() + value.tobytes())
     return digest.hexdigest()[:16]
+
+
+def _is_constant(value: object) -> bool:
+    """Is it a number, a text, or a tuple of such?"""
+    return isinstance(value, (bool, int, float, str)) or (isinstance(value, tuple) and all(map(_is_constant, value)))

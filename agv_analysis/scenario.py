@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
@@ -68,7 +69,7 @@ class Scenario:
         at_edge = node in ("error_detector", "controller")
         return self.relay.edge_domain_id if at_edge else self.relay.plant_domain_id
 
-    def with_settings(self, settings: Iterable[str], name: str) -> Scenario:
+    def with_settings(self, settings: Iterable[str], name: str = "scenario") -> Scenario:
         """The scenario with settings `node.parameter=value` on top of it, called `name` in messages.
 
         Raises ParameterError.
@@ -97,12 +98,13 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
-def load_scenario(path: str, settings: Iterable[str] = ()) -> Scenario:
+def load_scenario(path: str | Path, settings: Iterable[str] = ()) -> Scenario:
     """Scenario from a params file and settings `node.parameter=value`. Raises ParameterError."""
-    return Scenario(**resolve(SCHEMAS, _own(read_sections(path), path), settings, path))
+    name = str(path)
+    return Scenario(**resolve(SCHEMAS, _own(read_sections(name), name), settings, name))
 
 
-def parse_scenario(text: str, name: str, settings: Iterable[str] = ()) -> Scenario:
+def parse_scenario(text: str, name: str = "scenario", settings: Iterable[str] = ()) -> Scenario:
     """As `load_scenario`, from the text of a params file called `name` in messages."""
     return Scenario(**resolve(SCHEMAS, _own(parse_sections(text, name), name), settings, name))
 

@@ -48,7 +48,7 @@ class _OwnErrorDetectorParameters(LoopParameters):
         "hold",
         "what an outdated pose is compared with; hold: the reference of now, align: that of its instant, predict: it "
         "is moved on by the plant's model under the commands sent since, and compared with the reference of now",
-        choices=STALENESS_POLICIES.names(),
+        choices=STALENESS_POLICIES.names,
         remedy=STALENESS_POLICIES.remedy,
     )
     integration: str = parameter(
@@ -73,16 +73,17 @@ class _OwnErrorDetectorParameters(LoopParameters):
 
 
 _TAKEN_AT_ERROR_DETECTOR = tuple(parameters_of(_OwnErrorDetectorParameters))
-_PolicyParameters = schema_of(
-    "PolicyParameters", STALENESS_POLICIES.usable(), _TAKEN_AT_ERROR_DETECTOR, globals()
-)  # fmt: skip
+
+
+def _policy_parameters() -> type:
+    return schema_of("PolicyParameters", STALENESS_POLICIES.usable(), _TAKEN_AT_ERROR_DETECTOR, globals())
 
 
 @dataclass(frozen=True)
 class ErrorDetectorParameters(_OwnErrorDetectorParameters):
     """Parameters of the node `error_detector`."""
 
-    of_policies: Any = merged(_PolicyParameters, STALENESS_POLICIES.refusal)
+    of_policies: Any = merged(_policy_parameters, STALENESS_POLICIES.refusal)
     """Parameters of policies that have some, `policy.parameter`."""
 
     def __post_init__(self) -> None:
@@ -131,7 +132,7 @@ class _OwnControllerParameters(LoopParameters):
         "control law; kanayama: the paper's, with the gains kx, ky, ktheta, state_feedback: linear in the tracking "
         "error, pure_pursuit: along the circle to the point that the reference reaches look_ahead later; the gains of "
         "others than kanayama have the law's name before them",
-        choices=CONTROL_LAWS.names(),
+        choices=CONTROL_LAWS.names,
         remedy=CONTROL_LAWS.remedy,
     )
     kx: float = field_of(_KANAYAMA, "kx")
@@ -150,17 +151,18 @@ class _OwnControllerParameters(LoopParameters):
 
 
 _TAKEN_AT_CONTROLLER = tuple(parameters_of(_OwnControllerParameters))
-_LawParameters = schema_of(
-    "LawParameters", {name: law for name, law in CONTROL_LAWS.usable().items() if name != KANAYAMA},
-    _TAKEN_AT_CONTROLLER, globals(),
-)  # fmt: skip
+
+
+def _law_parameters() -> type:
+    others = {name: law for name, law in CONTROL_LAWS.usable().items() if name != KANAYAMA}
+    return schema_of("LawParameters", others, _TAKEN_AT_CONTROLLER, globals())
 
 
 @dataclass(frozen=True)
 class ControllerParameters(_OwnControllerParameters):
     """Parameters of the node `controller`."""
 
-    of_laws: Any = merged(_LawParameters, CONTROL_LAWS.refusal)
+    of_laws: Any = merged(_law_parameters, CONTROL_LAWS.refusal)
     """Gains of other laws than kanayama, `law.gain`."""
 
     def __post_init__(self) -> None:

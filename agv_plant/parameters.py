@@ -33,7 +33,7 @@ class _OwnPlantParameters(LoopParameters):
         UNICYCLE,
         "vehicle; unicycle: turns as commanded, the paper's, bicycle: steers its front wheel; what vehicles have of "
         "their own has their name before it",
-        choices=VEHICLES.names(),
+        choices=VEHICLES.names,
         remedy=VEHICLES.remedy,
     )
     integration: str = parameter("euler", "how the plant integrates one period", choices=tuple(STEPS))
@@ -96,14 +96,17 @@ class _OwnPlantParameters(LoopParameters):
 
 
 _TAKEN = tuple(parameters_of(_OwnPlantParameters))
-_VehicleParameters = schema_of("ParametersOfVehicles", VEHICLES.usable(), _TAKEN, globals())
+
+
+def _vehicle_parameters() -> type:
+    return schema_of("ParametersOfVehicles", VEHICLES.usable(), _TAKEN, globals())
 
 
 @dataclass(frozen=True)
 class PlantParameters(_OwnPlantParameters):
     """Parameters of the node `plant`."""
 
-    of_vehicles: Any = merged(_VehicleParameters, VEHICLES.refusal)
+    of_vehicles: Any = merged(_vehicle_parameters, VEHICLES.refusal)
     """Parameters of vehicles that have some, `vehicle.parameter`."""
 
     def __post_init__(self) -> None:
@@ -141,7 +144,7 @@ _TRIALS = ((0.0, 0.0, 0.5, 1.0, 0.1), (1.0, -2.0, 3.0, 0.0, 0.0))
 class ChannelParameters:
     """One direction of the radio channel."""
 
-    model: str = parameter("perfect", "channel model", choices=CHANNELS.names(), remedy=CHANNELS.remedy)
+    model: str = parameter("perfect", "channel model", choices=CHANNELS.names, remedy=CHANNELS.remedy)
     p: float = parameter(
         0.0,
         "bernoulli: loss probability; coverage_hole: the same outside of the holes; gilbert_elliott: probability of "

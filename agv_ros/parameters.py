@@ -115,7 +115,7 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
     above: float | None = None,
-    choices: tuple[str, ...] = (),
+    choices: tuple[str, ...] | Callable[[], tuple[str, ...]] = (),
     runtime: bool = False,
     any_length: bool = False,
     remedy: str = "",
@@ -124,7 +124,7 @@ def parameter(
 
     `low` and `high` are included, `above` is not; a double is finite unless `high` is inf. A `runtime` parameter can be
     changed while the node runs. A tuple default makes a double_array of that length, or of any but 0. `remedy` says
-    what to do where none of the `choices` is meant.
+    what to do where none of the `choices` is meant; they are a function where others may be added in a running process.
     """
     known = {
         "description": description, "unit": unit, "low": low, "high": high, "above": above, "choices": choices,
@@ -138,12 +138,23 @@ def group(schema: type[T]) -> T:
     return dataclasses.field(default_factory=schema, metadata={"group": schema})
 
 
-def merged(schema: type, refusal: Callable[[str], str] = lambda _: "") -> Any:
-    """As `group`, but the names of the nested dataclass stay as they are.
+def merged(schema: Callable[[], type], refusal: Callable[[str], str] = lambda _: "") -> Any:
+    """As `group`, but the names of the nested dataclass stay as they are, and `schema` gives the dataclass.
 
+    It is called at once, so that processes that load instances of the dataclass know it, and again after
+    `forget_parameters`.
     `refusal` says of the first word of a dotted name why there is no such parameter, if it knows.
     """
-    return dataclasses.field(default_factory=schema, metadata={"group": schema, "prefix": "", "refusal": refusal})
+    schema()
+    return dataclasses.field(
+        default_factory=lambda: schema()(), metadata={"group": schema, "prefix": "", "refusal": refusal}
+    )
+
+
+def _group_of(field: dataclasses.Field[Any]) -> type:
+    """The nested dataclass of a group."""
+    found = field.metadata["group"]
+    return found if isinstance(found, type) else found()
 
 
 def _prefix(field: dataclasses.Field[Any]) -> str:
@@ -175,22 +186,28 @@ def _parameters_of(schema: type) -> KnownParameters:
     found = KnownParameters()
     for field in dataclasses.fields(schema):
         if "group" in field.metadata:
-            for name, inner in parameters_of(field.metadata["group"]).items():
+            for name, inner in parameters_of(_group_of(field)).items():
                 full = _prefix(field) + name
                 found[full] = dataclasses.replace(inner, name=full)
             found.refusals += (field.metadata["refusal"],) if "refusal" in field.metadata else ()
             continue
         known = dict(field.metadata["parameter"])
-        free = known.pop("any_length")
+        free, choices = known.pop("any_length"), known.pop("choices")
         length = len(field.default) if isinstance(field.default, tuple) and not free else None
         found[field.name] = Parameter(
             name=field.name,
             kind=_KINDS[type(field.default)],
             default=field.default,
             length=length,
+            choices=choices() if callable(choices) else choices,
             **known,
         )
     return found
+
+
+def forget_parameters() -> None:
+    """To be called where a schema has become another one: choices and groups are asked for anew."""
+    _parameters_of.cache_clear()
 
 
 def check_values(schema: type, values: Mapping[str, object], owner: str = "") -> dict[str, Any]:
@@ -221,7 +238,7 @@ def _assemble(schema: type[T], values: Mapping[str, Any]) -> T:
         if "group" in field.metadata:
             prefix = _prefix(field)
             inner = {name[len(prefix) :]: value for name, value in values.items() if name.startswith(prefix)}
-            arguments[field.name] = _assemble(field.metadata["group"], inner)
+            arguments[field.name] = _assemble(_group_of(field), inner)
         elif field.name in values:
             arguments[field.name] = values[field.name]
     return schema(**arguments)

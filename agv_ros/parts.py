@@ -29,7 +29,7 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
-from agv_ros.parameters import Parameter, ParameterError, group, parameter
+from agv_ros.parameters import Parameter, ParameterError, forget_parameters, group, parameter
 from agv_ros.substitution import Function
 
 OWN = "agv_ncs"
@@ -144,11 +144,29 @@ class Functions:
     """Those of this package."""
     reserved: tuple[str, ...] = ()
     """Names of this package that stand for something else than a function."""
+    _registered: dict[str, tuple[str, Function]] = field(default_factory=dict, compare=False)
+    """Functions of this process alone, each after what it is called in messages."""
 
     def names(self) -> tuple[str, ...]:
-        """All names: those of this package, then those of other installed ones, be they usable or not."""
-        known = (*self.own, *self.reserved)
-        return (*known, *(name for name in installed(self.group) if name not in known))
+        """All names: those of this package, of other installed ones, be they usable or not, and of this process."""
+        return tuple(dict.fromkeys((*self.own, *self.reserved, *installed(self.group), *self._registered)))
+
+    def register(self, name: str, function: Function) -> None:
+        """Add a function for this process alone, or put another one in the place of one that was added so.
+
+        Raises PartError for a name that is taken, or if it is no function.
+        """
+        self._registered[name] = self._named(name, function)
+        forget_parameters()
+
+    def _named(self, name: str, function: Function) -> tuple[str, Function]:
+        """What a function that is registered is called in messages, and the function itself."""
+        if name in self.names() and name not in self._registered:
+            raise PartError(f"there is a {self.kind} {name} already: choose another name")
+        function = getattr(function, "py_func", function)  # one that its author has compiled with numba
+        if not isinstance(function, types.FunctionType):
+            raise PartError(f"{self.kind} {name} must be a function, found {_short(function)}")
+        return f"{self.kind} {name} (registered by {function.__module__})", function
 
     @property
     def remedy(self) -> str:
@@ -160,6 +178,8 @@ class Functions:
 
         Raises PartError if there is none, if two have this name, or if it cannot be loaded.
         """
+        if name in self._registered:
+            return self._registered[name]
         points = installed(self.group).get(name, ())
         known = name in self.own or name in self.reserved
         sources = [*(["that of agv_ncs"] if known else []), *(f"{point.value} of another package" for point in points)]
@@ -189,6 +209,23 @@ class Registry(Functions):
 
     call: Call = Call("", (), "", (), "", "", ())
     _found: dict[str, Part] = field(default_factory=dict, compare=False)
+
+    def register(self, name: str, function: Function) -> None:
+        """Add a part for this process alone, or put another one with the same parameters in its place.
+
+        Raises PartError as for functions, and if it cannot be called.
+        """
+        where, function = self._named(name, function)
+        part, before = part_of(name, where, function, self.call), self._found.get(name)
+        names = [known.name for known in part.parameters]
+        if before is not None and names != [known.name for known in before.parameters]:
+            raise PartError(
+                f"{where}: its parameters are {', '.join(names) or 'none'}, but scenarios may hold values of "
+                f"{', '.join(known.name for known in before.parameters) or 'none'}, with which it was registered "
+                "before: choose another name"
+            )
+        self._found[name] = part
+        super().register(name, function)
 
     def find(self, name: str) -> Part:
         """The part called `name`. Raises PartError as `load` does, and if it cannot be called."""
@@ -430,8 +467,10 @@ def schema_of(class_name: str, parts: Mapping[str, Part], taken: Sequence[str], 
     """A schema with a group of parameters for each part that has some: names `part.parameter`.
 
     Parts whose names are `taken` by parameters of the node are left out. The classes are put into the `module` given by
-    its globals, where other processes find them.
+    its globals, where other processes find them; as long as the parts are the same ones, so is the class.
     """
+    if class_name in module and module[class_name].of_parts == parts:
+        return module[class_name]  # type: ignore[no-any-return]
     fields: list[tuple[str, type, Any]] = []
     for part in parts.values():
         if part.parameters and part.name not in (*taken, *_OF_ROS):
@@ -439,7 +478,9 @@ def schema_of(class_name: str, parts: Mapping[str, Part], taken: Sequence[str], 
                 f"{class_name}_{part.name}", [(p.name, float, _field_of(p)) for p in part.parameters], module
             )
             fields.append((part.name, own, group(own)))
-    return _dataclass(class_name, fields, module)
+    made = _dataclass(class_name, fields, module)
+    made.of_parts = dict(parts)  # type: ignore[attr-defined]
+    return made
 
 
 def _dataclass(name: str, fields: list[tuple[str, type, Any]], module: dict[str, Any]) -> type:
@@ -459,7 +500,7 @@ def values_of(part: Part, groups: object) -> tuple[float, ...]:
     if own is None:
         raise PartError(
             f"{part.where} could not be loaded when its parameters were declared: let its module import nothing of "
-            "agv_ncs but agv_ros.parts"
+            "agv_ncs but agv_ros.parts; or it was registered after its node's parameters were made: make them anew"
         )
     return tuple(getattr(own, known.name) for known in part.parameters)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-LAYERS = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis")
+LAYERS = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs")
 """From the lowest to the highest; each may import those before it."""
 
 ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|(rosidl|ament|rmw|rosbag2|tf2|launch)(_.*)?")

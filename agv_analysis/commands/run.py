@@ -11,7 +11,7 @@ from agv_analysis.commands import needs_ros, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.runtime.fleet import Vehicle
-    from agv_analysis.runtime.runner import Outcome
+    from agv_analysis.runtime.outcome import Outcome
     from agv_analysis.scenario import Scenario
 
 PITCH = 20.0

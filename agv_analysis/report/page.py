@@ -31,9 +31,9 @@ _HEIGHTS = {"time": 820}
 _HEIGHT = 460
 
 
-def write_report(analysis: Observations, path: Path) -> None:
+def write_report(analysis: Observations, path: str | Path) -> None:
     """Write the report of a run. Raises UserError if it cannot be written or if plotly or jinja2 is not installed."""
-    write_page(render(analysis), path)
+    write_page(render(analysis), Path(path))
 
 
 def write_page(html: str, path: Path) -> None:

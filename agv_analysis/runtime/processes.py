@@ -18,8 +18,9 @@ from typing import Any
 
 import click
 
+from agv_analysis.runtime.outcome import Outcome
 from agv_analysis.runtime.run_setup import params_file, recording_of, scenario_that_waits
-from agv_analysis.runtime.runner import Outcome, Progress, run_fleet
+from agv_analysis.runtime.runner import Progress, run_fleet
 from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.plant_node import progress_line, progress_of

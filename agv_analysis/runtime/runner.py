@@ -14,6 +14,7 @@ from rclpy.executors import Executor
 
 from agv_analysis.runtime.edge_inputs import EdgeInputs
 from agv_analysis.runtime.one_process import OneProcess
+from agv_analysis.runtime.outcome import Outcome
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.runtime.replay_node import Pace, ReplayNode, ReplayRecorder
 from agv_analysis.runtime.run_setup import PATIENCE, params_file, recording_of, scenario_that_waits
@@ -40,21 +41,6 @@ _EVENTS_PER_LOOK = 256
 
 Progress = Callable[[int], None]
 """Called with the number of steps done, every now and then."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """How a run ended."""
-
-    steps: int
-    rate: float
-    """Steps per second of wall time, without start-up and shut-down; 0 if there were too few to tell."""
-    failure: str
-    """Why the run ended early, empty if it did not."""
-    recording: str
-    """What the recorder says of the bag, empty without one."""
-    recording_failure: str
-    """Why the bag is not complete, empty if every message that was published is in it."""
 
 
 def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, executor: str = "events") -> Outcome:

@@ -25,11 +25,7 @@ def replacements_of(scenario: Scenario) -> Replacements:
 
     Those that the placeholders are themselves are left out, so that loops of the same parts are compiled once.
     """
-    return _replacements(scenario.controller.law, scenario.error_detector.policy, scenario.plant.vehicle)
-
-
-@functools.cache
-def _replacements(law: str, policy: str, vehicle: str) -> Replacements:
+    law, policy, vehicle = scenario.controller.law, scenario.error_detector.policy, scenario.plant.vehicle
     found: dict[Function, Function] = {}
     if law != KANAYAMA:
         chosen = CONTROL_LAWS.find(law)

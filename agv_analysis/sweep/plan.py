@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,8 +16,6 @@ from agv_analysis.simulation.single import steps_of
 from agv_ros.errors import UserError
 from agv_ros.parameters import SHARED, KnownParameters, as_dict, build, parameters_of
 from agv_ros.params_file import parse_setting
-
-KNOWN: Mapping[str, KnownParameters] = {node: parameters_of(schema) for node, schema in SCHEMAS.items()}
 
 MAX_POINTS = 1_000_000
 MAX_VALUES = 10_000
@@ -48,8 +46,33 @@ class Axis:
     @property
     def label(self) -> str:
         """The parameter with its unit, for people."""
-        unit = KNOWN[self.node][self.parameter].unit
+        unit = known_parameters()[self.node][self.parameter].unit
         return f"{self.name} [{unit}]" if unit else self.name
+
+
+def known_parameters() -> Mapping[str, KnownParameters]:
+    """What each node of a loop has of parameters, by their names."""
+    return {node: parameters_of(schema) for node, schema in SCHEMAS.items()}
+
+
+def axis_of(name: str, values: Iterable[Any]) -> Axis:
+    """Axis of the parameter `node.parameter` over values of its type; a whole number is taken for a double.
+
+    Raises SweepError for no parameter or no values, ParameterError for a value that is not allowed.
+    """
+    node, _, parameter = name.partition(".")
+    known = known_parameters()[node].get(parameter) if node in SCHEMAS else None
+    if known is None:
+        raise SweepError(
+            f"{name} is no parameter; expected node.parameter, as in controller.kx, with a node of {', '.join(SCHEMAS)}"
+        )
+    plain = [value.item() if isinstance(value, np.generic) else value for value in values]
+    if known.kind == "double":
+        plain = [float(value) if type(value) is int else value for value in plain]
+    found = tuple(known.check(node, value) for value in plain)
+    if not found or len(set(found)) < len(found):
+        raise SweepError(f"{name}: must have values, each once, got {list(found)}")
+    return Axis(node, parameter, found)
 
 
 def parse_axis(text: str) -> Axis:
@@ -65,9 +88,10 @@ def parse_axis(text: str) -> Axis:
             f"--vary {text}: {error}; expected node.parameter=first:last:count, as in controller.kx=5:400:40, "
             "or a list, as in relay.uplink.n=0,5,10"
         ) from None
-    parsed = [parse_setting(f"{name}={value}", KNOWN) for value in values]
+    known = known_parameters()
+    parsed = [parse_setting(f"{name}={value}", known) for value in values]
     node, parameter, _ = parsed[0]
-    found = tuple(KNOWN[node][parameter].check(node, value) for _, _, value in parsed)
+    found = tuple(known[node][parameter].check(node, value) for _, _, value in parsed)
     if len(set(found)) < len(found):
         raise SweepError(f"--vary {text}: a value is named twice, and its runs would be the same")
     return Axis(node, parameter, found)
