@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import os
 import re
 import subprocess
 import sys
 import tempfile
+import textwrap
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 REPOSITORY = Path(__file__).parents[1]
 DEMO = "<!-- demo:begin -->\n", "<!-- demo:end -->"
 RANKING = "<!-- ranking:begin -->\n", "<!-- ranking:end -->"
+NAMES = "<!-- names:begin -->\n", "<!-- names:end -->"
+TYPES = "<!-- types:begin -->\n", "<!-- types:end -->"
 
 
 def command(*arguments: str) -> str:
@@ -54,6 +61,69 @@ def policies_page() -> str:
     return between(*RANKING, "\n".join(map(table_markdown, policy_tables())), text)
 
 
+def python_api_page() -> str:
+    """docs/python_api.md with its tables made anew, from the signatures and docstrings of the code."""
+    text = (REPOSITORY / "docs/python_api.md").read_text(encoding="utf-8")
+    return between(*TYPES, api_types(), between(*NAMES, api_names(), text))
+
+
+def api_names() -> str:
+    """A table of all names of agv_ncs."""
+    import agv_ncs
+
+    rows = ["| name | what it is |", "|---|---|"]
+    for name in agv_ncs._MODULES:
+        value = getattr(agv_ncs, name)
+        said = "version of the installed package" if name == "__version__" else first_line(value)
+        arguments = f"({', '.join(inspect.signature(value).parameters)})" if inspect.isfunction(value) else ""
+        rows.append(f"| `{name}{arguments}` | {escaped(said)} |")
+    return "\n".join(rows) + "\n"
+
+
+def first_line(value: Any) -> str:
+    """The first paragraph of a docstring as one line."""
+    return " ".join((inspect.getdoc(value) or "").partition("\n\n")[0].split())
+
+
+def api_types() -> str:
+    """A table of the fields and properties of each type of agv_ncs that holds results."""
+    import agv_ncs
+
+    types = (
+        agv_ncs.Run, agv_ncs.Observations, agv_ncs.Analysis, agv_ncs.Margins, agv_ncs.Bag, agv_ncs.SweepResult,
+        agv_ncs.Outcome, agv_ncs.Quantity,
+    )  # fmt: skip
+    return "\n".join(
+        f"### {kind.__name__}\n\n{first_line(kind)}\n\n| field | type | meaning |\n|---|---|---|\n"
+        + "".join(f"| `{name}` | {escaped(of)} | {escaped(meaning)} |\n" for name, of, meaning in fields_of(kind))
+        for kind in types
+    )
+
+
+def fields_of(kind: type) -> Iterator[tuple[str, str, str]]:
+    """Name, type and meaning of each public field, property and method that a class itself has, from its source."""
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    assert isinstance(body, ast.ClassDef)
+    for node, after in zip(body.body, [*body.body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            is_documented = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            meaning = str(after.value.value) if is_documented else ""  # type: ignore[union-attr]
+            name, of = node.target.id, ast.unparse(node.annotation)
+        elif isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            is_property = any(isinstance(one, ast.Name) and one.id == "property" for one in node.decorator_list)
+            name = node.name if is_property else f"{node.name}({', '.join(a.arg for a in node.args.args[1:])})"
+            of, meaning = ast.unparse(node.returns) if node.returns else "", ast.get_docstring(node) or ""
+        else:
+            continue
+        if not name.startswith("_"):
+            yield name, f"`{of}`", " ".join(meaning.partition("\n\n")[0].split())
+
+
+def escaped(text: str) -> str:
+    """Text for a cell of a table."""
+    return text.replace("|", "\\|")
+
+
 def between(begin: str, end: str, block: str, text: str) -> str:
     """`text` with another block between two marks."""
     pattern = f"{re.escape(begin)}.*?(?={re.escape(end)})"
@@ -81,6 +151,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         (REPOSITORY / "docs/paper.md").write_text(paper_page(folder), encoding="utf-8")
     (REPOSITORY / "docs/policies.md").write_text(policies_page(), encoding="utf-8")
+    (REPOSITORY / "docs/python_api.md").write_text(python_api_page(), encoding="utf-8")
     (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
     (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")
 

@@ -181,6 +181,38 @@ def start() -> Iterator[Start]:
         child.process.communicate(timeout=30.0)
 
 
+NO_ROS = """
+import re, sys
+
+class NoRos:
+    def find_spec(self, name, path=None, target=None):
+        if re.match(r"(rclpy|\\w+_msgs|\\w+_interfaces|(rosidl|ament|rmw|rosbag2|launch_ros)\\w*)(\\.|$)", name):
+            raise ModuleNotFoundError(f"no ROS here: {name}", name=name)
+
+sys.meta_path.insert(0, NoRos())
+sys.argv = sys.argv[1:]
+"""
+
+Code = Callable[..., str]
+
+
+@pytest.fixture(scope="session")
+def without_ros() -> Code:
+    """Run Python code in a process in which ROS cannot be imported; gives what it printed, fails if it fails."""
+
+    def run(code: str, *arguments: object, cwd: Path = REPOSITORY, path: Path | None = None) -> str:
+        folders = [str(REPOSITORY), *([str(path)] if path else [])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders), "MPLBACKEND": "agg"}
+        done = subprocess.run(
+            [sys.executable, "-c", NO_ROS + code, *map(str, arguments)],
+            cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout
+        return done.stdout
+
+    return run
+
+
 @pytest.fixture
 def agv_ncs(start: Start) -> Callable[..., tuple[int, str]]:
     """Run a command of `agv-ncs` to its end: exit status and output."""
