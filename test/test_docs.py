@@ -53,3 +53,19 @@ def test_the_commands_of_the_readme_exist(agv_ncs: Callable[..., tuple[int, str]
     assert set(re.findall(r"(?:`|^ +)make (\w+)", readme, re.MULTILINE)) <= set(targets)
     for path in set(re.findall(r"(?:config|docs|bags)/[\w/]+\.\w+", readme)):
         assert (REPOSITORY / path).exists() or path.startswith("bags/demo/"), path
+
+
+@pytest.mark.parametrize("page", ["docs/architecture.md", "CONTRIBUTING.md"])
+def test_what_the_pages_for_developers_name_is_there(page: str) -> None:
+    text = (REPOSITORY / page).read_text()
+    paths = set(re.findall(r"`((?:agv_\w+|test|docs|config|examples)/[\w/.]*)`", text))
+    assert paths
+    assert [path for path in sorted(paths) if not (REPOSITORY / path).exists()] == []
+    targets = re.findall(r"^(\w+):", (REPOSITORY / "Makefile").read_text(), re.MULTILINE)
+    assert set(re.findall(r"(?:`|^ +)make (\w+)", text, re.MULTILINE)) <= set(targets)
+
+
+def test_the_page_of_the_architecture_names_every_room() -> None:
+    tree = (REPOSITORY / "docs/architecture.md").read_text().partition("## Folders")[2].partition("\nImports")[0]
+    rooms = {path.parent.name for layer in REPOSITORY.glob("agv_*") for path in layer.rglob("__init__.py")}
+    assert [room for room in sorted(rooms) if f"{room}/" not in tree] == []
