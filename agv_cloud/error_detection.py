@@ -12,7 +12,7 @@ from agv_cloud.reference.path_reference import PathReference
 from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.reference.reference import Reference
 from agv_cloud.staleness.estimate import PoseEstimator
-from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES, number_of
 from agv_cloud.step import EdgeStep
 from agv_cloud.tracking_error import tracking_error
 from agv_ros.parts import PartError, complaint
@@ -46,7 +46,7 @@ class ErrorDetection:
 
     def _new_estimator(self) -> PoseEstimator:
         settings, name = self.settings, self.settings.policy
-        number = STALENESS_POLICIES.names().index(name)
+        number = number_of(name)
         return PoseEstimator(
             STALENESS_POLICIES.find(name), number, settings.policy_values, settings.ts, settings.integration == "arc"
         )

@@ -9,7 +9,7 @@ from typing import Any
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.reference.tracks import TRACKS
-from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES, number_of
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES
 from agv_ros.parameters import LoopParameters, ParameterError, merged, parameter, parameters_of
@@ -90,7 +90,7 @@ class ErrorDetectorParameters(_OwnErrorDetectorParameters):
         """Check what no single bound can say."""
         policy = STALENESS_POLICIES.find(self.policy)
         refuse_taken(policy, _TAKEN_AT_ERROR_DETECTOR)
-        number, arc = STALENESS_POLICIES.names().index(self.policy), self.integration == "arc"
+        number, arc = number_of(self.policy), self.integration == "arc"
         for held, target, reference, v, w in _STALE_TRIALS:
             try_part(
                 policy, STALENESS_POLICIES.call, number, held, target, reference, v, w, self.ts, arc, self.policy_values

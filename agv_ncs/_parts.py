@@ -11,7 +11,7 @@ from typing import Any
 
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
-from agv_plant.channels import Model
+from agv_plant.channels.model import Model
 from agv_plant.channels.registry import CHANNELS
 from agv_plant.vehicle.registry import VEHICLES
 

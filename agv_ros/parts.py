@@ -18,12 +18,14 @@ disturbs nobody until it is chosen.
 from __future__ import annotations
 
 import functools
+import importlib
 import inspect
 import keyword
 import math
+import pkgutil
 import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
@@ -250,6 +252,24 @@ class Registry(Functions):
             except PartError as error:
                 return str(error)
         return ""
+
+
+def own_parts(package: str, first: str, besides: Collection[str], name: str = "") -> dict[str, Function]:
+    """The functions of this package's parts by name, found in the modules of a folder, so that a new one is one file.
+
+    That of a module is the one called as the module is, or `name`; `besides` are the modules that hold none. They are
+    in the order of the alphabet after the `first`, which is the default.
+    """
+    folder = importlib.import_module(package)
+    found: dict[str, Function] = {}
+    modules = (known.name for known in pkgutil.iter_modules(folder.__path__))
+    for module in sorted(modules, key=lambda module: (module != first, module)):
+        if module not in besides:
+            function = getattr(importlib.import_module(f"{package}.{module}"), name or module, None)
+            if not isinstance(function, types.FunctionType):
+                raise PartError(f"{package}.{module} has no function {name or module}, and is not said to hold none")
+            found[module] = function
+    return found
 
 
 @functools.cache

@@ -9,8 +9,7 @@ from agv_analysis.scenario import PART_CHOICES, SCHEMAS
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.reference.tracks import TRACKS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
-from agv_plant.channels import MODELS
-from agv_plant.channels.registry import CHANNELS
+from agv_plant.channels.registry import CHANNELS, MODELS
 from agv_plant.vehicle.registry import VEHICLES
 from agv_ros.parameters import Parameter, parameters_of
 

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled, numbers
 from agv_analysis.simulation.link_loop import LinkInputs
 from agv_analysis.simulation.noise import normals
-from agv_plant.channels import GOOD, MODELS
+from agv_plant.channels.model import GOOD
 from agv_plant.channels.position_dependent import kind_of
-from agv_plant.channels.registry import SHARED, TRACE, find_model
+from agv_plant.channels.registry import MODELS, SHARED, TRACE, find_model
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import Channel, delay_draws, draws, losses, own_stream
 from agv_plant.radio.channel_setup import Segment, levels_of, segments_of, spatial_table_of

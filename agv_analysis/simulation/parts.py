@@ -13,7 +13,7 @@ from agv_analysis.simulation.link_loop import recall_memory, store_memory
 from agv_cloud.control.command import control_law
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.staleness.estimate import staleness_policy
-from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_cloud.staleness.registry import COMPILED, STALENESS_POLICIES
 from agv_plant.vehicle.motion import vehicle_step
 from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_ros.parts import PartError, complaint, culprit
@@ -32,7 +32,7 @@ def replacements_of(scenario: Scenario) -> Replacements:
         found[control_law] = chosen.adapter
         if chosen.memory:
             found[recall_memory], found[store_memory] = memory_functions(len(chosen.memory))
-    if policy not in STALENESS_POLICIES.own:
+    if policy not in COMPILED:
         found[staleness_policy] = STALENESS_POLICIES.find(policy).adapter
     if vehicle != UNICYCLE:
         found[vehicle_step] = VEHICLES.find(vehicle).adapter

@@ -17,7 +17,7 @@ from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.simulated_link import SimulatedLink
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.staleness.estimate import is_stepwise
-from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_cloud.staleness.registry import number_of
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.parameters import PlantParameters
 from agv_plant.vehicle.motion import NOISE, SLIP, vehicle_parameters
@@ -111,7 +111,7 @@ def obeys_at_once(plant: PlantParameters) -> bool:
 def settings_of(scenario: Scenario) -> Settings:
     """What a slot of the loop needs to know of a scenario."""
     controller, plant, edge = scenario.controller, scenario.plant, scenario.error_detector
-    policy = STALENESS_POLICIES.names().index(edge.policy)
+    policy = number_of(edge.policy)
     return Settings(
         gains=controller.gains, v_max=controller.v_max, ts=plant.ts,
         look_ahead=controller.look_ahead, ahead=controller.steps_ahead or None,

@@ -9,10 +9,7 @@ gains.
 
 from __future__ import annotations
 
-from agv_cloud.control.kanayama import kanayama
-from agv_cloud.control.pure_pursuit import pure_pursuit
-from agv_cloud.control.state_feedback import state_feedback
-from agv_ros.parts import Call, Registry
+from agv_ros.parts import Call, Registry, own_parts
 
 KANAYAMA = "kanayama"
 """The paper's law, whose gains are parameters of the controller without a name before them."""
@@ -20,7 +17,7 @@ KANAYAMA = "kanayama"
 CONTROL_LAWS = Registry(
     kind="control law",
     group="agv_ncs.control_laws",
-    own={KANAYAMA: kanayama, "state_feedback": state_feedback, "pure_pursuit": pure_pursuit},
+    own=own_parts("agv_cloud.control", KANAYAMA, besides=("command", "command_plan", "registry")),
     call=Call(
         arguments="x_e, y_e, theta_e, v_r, w_r, memory, parameters, ts, look_ahead",
         required=("x_e", "y_e", "theta_e", "v_r", "w_r"),

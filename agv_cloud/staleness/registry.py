@@ -10,16 +10,13 @@ If it names them it also gets the command v [m/s], w [rad/s] that was sent in th
 
 from __future__ import annotations
 
-from agv_cloud.staleness.align import align
-from agv_cloud.staleness.hold import hold
-from agv_cloud.staleness.predict import predict
-from agv_ros.parts import Call, Registry
+from agv_ros.parts import Call, Registry, own_parts
 from agv_ros.pose import Pose
 
 STALENESS_POLICIES = Registry(
     kind="staleness policy",
     group="agv_ncs.staleness_policies",
-    own={"hold": hold, "align": align, "predict": predict},
+    own=own_parts("agv_cloud.staleness", "hold", besides=("estimate", "registry")),
     call=Call(
         arguments="number, held, target, reference, v, w, ts, arc, parameters",
         required=("held", "target", "reference"),
@@ -33,5 +30,13 @@ STALENESS_POLICIES = Registry(
     ),
 )
 
+COMPILED = ("hold", "align", "predict")
+"""Policies that every compiled loop has in it and chooses by number; others are put in their place."""
+
 HOLD, ALIGN, PREDICT = range(3)
-"""Numbers of the policies of this package, in the order of their names."""
+"""Their numbers."""
+
+
+def number_of(policy: str) -> int:
+    """Number of a policy among those that are compiled in; that of the others is one more."""
+    return COMPILED.index(policy) if policy in COMPILED else len(COMPILED)

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from agv_plant.parameters import ChannelParameters
+
 
 def gilbert_elliott(
     state: int, u_loss: float, u_change: float, p: float, r: float, h: float, k: float
@@ -17,3 +23,8 @@ def gilbert_elliott(
     if state == 0:
         return u_loss >= k, 1 if u_change < p else 0
     return u_loss >= h, 0 if u_change < r else 1
+
+
+def model(c: ChannelParameters, k: int, u: Sequence[float], state: int) -> tuple[bool, int]:
+    """The channel with this name, see `model.Model`."""
+    return gilbert_elliott(state, u[0], u[1], c.p, c.r, c.h, c.k)

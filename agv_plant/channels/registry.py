@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from agv_plant.channels import MODELS, Model
+from agv_plant.channels.model import Model
 from agv_plant.channels.position_dependent import PLACED
-from agv_ros.parts import Functions, PartError
+from agv_ros.parts import Functions, PartError, own_parts
 
 GROUP = "agv_ncs.channels"
+
+MODELS: dict[str, Model] = own_parts(
+    "agv_plant.channels", "perfect",
+    besides=("coverage_hole", "model", "position_dependent", "rayleigh", "registry", "trace"), name="model",
+)  # fmt: skip
+"""Those of this package that see neither the place nor other vehicles."""
 
 TRACE = "trace"
 """The model whose verdicts stand in a file."""

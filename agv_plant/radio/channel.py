@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_plant.channels import GOOD, Model
+from agv_plant.channels.model import GOOD, Model
 from agv_plant.channels.position_dependent import NOWHERE, kind_of, outcome_at
 from agv_plant.channels.registry import SHARED, TRACE, ChannelError, find_model
 from agv_plant.channels.trace import TraceError, load_trace, trace

@@ -6,7 +6,7 @@ import heapq
 import math
 from typing import NamedTuple
 
-from agv_plant.channels import GOOD
+from agv_plant.channels.model import GOOD
 from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.radio.channel import Channel, SlotOutcome
 from agv_plant.radio.delay import EXPIRED, whole_slots

@@ -9,9 +9,7 @@ how its axes are turned.
 
 from __future__ import annotations
 
-from agv_plant.vehicle.bicycle import bicycle
-from agv_plant.vehicle.unicycle import unicycle
-from agv_ros.parts import Call, Registry
+from agv_ros.parts import Call, Registry, own_parts
 
 UNICYCLE = "unicycle"
 """The paper's vehicle."""
@@ -19,7 +17,7 @@ UNICYCLE = "unicycle"
 VEHICLES = Registry(
     kind="vehicle",
     group="agv_ncs.vehicles",
-    own={UNICYCLE: unicycle, "bicycle": bicycle},
+    own=own_parts("agv_plant.vehicle", UNICYCLE, besides=("drive", "motion", "registry", "slip")),
     call=Call(
         arguments="x, y, theta, states, v, w, v_driven, w_driven, dt, arc, parameters",
         required=("x", "y", "theta", "v", "w", "dt"),

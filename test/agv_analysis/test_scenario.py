@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from agv_analysis.scenario import PART_CHOICES, SCHEMAS, Scenario, load_scenario, parse_scenario
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.reference.tracks import TRACKS
-from agv_plant.channels import MODELS
+from agv_plant.channels.registry import MODELS
 from agv_ros.parameters import Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid
 

@@ -8,7 +8,7 @@ import pytest
 
 from agv_cloud.slot_stepping import SlotStepping
 from agv_cloud.staleness.estimate import PoseEstimator
-from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_cloud.staleness.registry import STALENESS_POLICIES, number_of
 from agv_ros.messages import DELIVERED, LOST, Slot, StampedPose
 from agv_ros.stamps import Grid, OffGridError
 
@@ -16,7 +16,7 @@ GRID = Grid(1_000_000_000, 5_000_000)
 
 
 def estimator(policy: str) -> PoseEstimator:
-    number = STALENESS_POLICIES.names().index(policy)
+    number = number_of(policy)
     return PoseEstimator(STALENESS_POLICIES.find(policy), number, (), 0.005, False)
 
 

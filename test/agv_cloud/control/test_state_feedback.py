@@ -38,8 +38,9 @@ def test_on_the_track_the_reference_s_speeds_are_passed_on_to_the_last_bit(v_r: 
 def test_to_first_order_it_is_the_paper_s_law_with_gains_over_the_reference_s_speed() -> None:
     v_r, w_r, small = 0.8, 0.3, 1e-6
     for eps in small * np.eye(3):
-        found = state_feedback(*eps.tolist(), v_r, w_r, 4.0, v_r * 3.0, v_r * 2.0)
-        assert found == pytest.approx(kanayama(*eps.tolist(), v_r, w_r, 4.0, 3.0, 2.0), abs=1e-11)
+        x_e, y_e, theta_e = eps.tolist()
+        found = state_feedback(x_e, y_e, theta_e, v_r, w_r, 4.0, v_r * 3.0, v_r * 2.0)
+        assert found == pytest.approx(kanayama(x_e, y_e, theta_e, v_r, w_r, 4.0, 3.0, 2.0), abs=1e-11)
 
 
 @pytest.mark.parametrize(("v_r", "w_r"), [(1.0, 0.0), (0.7, 0.4), (-0.5, -0.2)])

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from scipy.stats import chisquare, norm
 
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
-from agv_plant.channels import MODELS
 from agv_plant.channels.bernoulli import bernoulli
 from agv_plant.channels.burst import burst
 from agv_plant.channels.gilbert_elliott import gilbert_elliott
 from agv_plant.channels.perfect import perfect
+from agv_plant.channels.registry import MODELS
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import losses
 from agv_ros.parameters import build

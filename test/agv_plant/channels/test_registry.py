@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from agv_plant.channels import MODELS
 from agv_plant.channels.position_dependent import PLACED
-from agv_plant.channels.registry import GROUP, known_models
+from agv_plant.channels.registry import GROUP, MODELS, known_models
 from agv_plant.random_stream import uniforms
 
 REPOSITORY = Path(__file__).parents[3]

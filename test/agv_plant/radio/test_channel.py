@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_plant.channels import MODELS
+from agv_plant.channels.registry import MODELS
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import Channel, losses
 
