@@ -1,0 +1,190 @@
+"""README's promise, counted: a law, vehicle, policy, channel with memory or criterion of our own is one new file.
+
+Each is put into a copy of the sources, as one file and nothing else, and has to be there wherever such parts are shown.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+SOURCES = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs")
+
+PARTS = {
+    "law": (
+        "agv_cloud/control/gentle.py",
+        """
+from __future__ import annotations
+from typing import Annotated
+from agv_ros.parts import Quantity
+
+def gentle(x_e: float, y_e: float, theta_e: float, v_r: float, w_r: float,
+           k: Annotated[float, Quantity("gain of everything", "1/s", low=0.0, high=9.0)] = 2.0) -> tuple[float, float]:
+    return v_r + k * x_e, w_r + k * (y_e + theta_e)
+""",
+        ("controller.law=gentle", "controller.gentle.k=1.5"),
+        "`gentle.k`",
+    ),
+    "vehicle": (
+        "agv_plant/vehicle/sluggish.py",
+        """
+from __future__ import annotations
+import math
+from typing import Annotated
+from agv_ros.parts import Quantity
+
+def sluggish(x: float, y: float, theta: float, turn: float, v: float, w: float, dt: float,
+             lag: Annotated[float, Quantity("time constant of the turn", "s", above=0.0)] = 0.1,
+             ) -> tuple[float, float, float, float]:
+    turn = turn + (1.0 - math.exp(-dt / lag)) * (w - turn)
+    return x + dt * v * math.cos(theta), y + dt * v * math.sin(theta), theta + dt * turn, turn
+""",
+        ("plant.vehicle=sluggish", "plant.sluggish.lag=0.05"),
+        "`sluggish.lag`",
+    ),
+    "policy": (
+        "agv_cloud/staleness/drift.py",
+        """
+from __future__ import annotations
+import math
+from typing import Any
+
+def drift(held: Any, target: Any, reference: Any, ts: float, share: float = 1.0) -> Any:
+    v = share * reference.v
+    there = held.x + ts * v * math.cos(held.theta), held.y + ts * v * math.sin(held.theta), held.theta
+    return there, (reference.x, reference.y, reference.theta)
+""",
+        ("error_detector.policy=drift", "error_detector.drift.share=0.9"),
+        "`drift.share`",
+    ),
+    "channel": (
+        "agv_plant/channels/sticky.py",
+        '''
+from __future__ import annotations
+from typing import Any
+
+def model(c: Any, k: int, u: Any, state: int) -> tuple[bool, int]:
+    """After a loss the next two slots are lost as well."""
+    if state > 0:
+        return True, state - 1
+    return (True, 2) if u[0] < c.p else (False, 0)
+''',
+        ("relay.uplink.model=sticky", "relay.uplink.p=0.05"),
+        "sticky",
+    ),
+}
+
+CRITERION = '''
+"""Is the AGV slower than a walker?"""
+from __future__ import annotations
+import numpy as np
+from agv_analysis.stability.criteria.criterion import Border, Criterion, Judgement, MapColumn, Margin
+
+def _judge(facts):
+    top = float(np.abs(facts.run.reference[:, 3]).max())
+    return Judgement("Slower than a walker", top < 1.6, f"at most {top:g} m/s", {"walker_top_speed": top})
+
+def _margins(facts):
+    yield Margin("walker.speed", "Walker\\'s speed", 1.6, "1.6 m/s")
+
+CRITERION = Criterion(
+    key="walker", order=90, title="A walker", asks="Is it slower than a walker?", assumes="Nothing.",
+    judge=_judge, margins=_margins, margin_names=(("walker.speed", "Walker\\'s speed"),),
+    at_once=lambda facts: [("Walker at once", "1.6 m/s")],
+    border=Border("walker", lambda scenario: scenario.controller.kx - 30.0),
+    map_column=MapColumn("n_walker", "walker", lambda points: np.full(len(points), 7), lambda loop: 7),
+)
+'''
+
+PLACES = """
+import sys
+from agv_analysis.explore.background_criteria import lap_rows
+from agv_analysis.explore.response import summary_rows
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate
+from agv_analysis.sweep.borders import border_places
+from agv_analysis.sweep.plan import parse_axis
+scenario = load_scenario("config/paper.yaml", ["plant.duration=2.0", "error_detector.track=line"])
+assert dict(summary_rows(simulate(scenario)))["Walker at once"] == "1.6 m/s"
+assert dict(lap_rows(scenario))["Walker's speed"] == "1.6 m/s"
+assert 29.0 < border_places(scenario, parse_axis("controller.kx=10:50:9"))["walker"][0] < 31.0
+"""
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the sources."""
+    folder = tmp_path_factory.mktemp("sources")
+    for name in (*SOURCES, "config"):
+        shutil.copytree(REPOSITORY / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def python(folder: Path, *arguments: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"}
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def agv_ncs(folder: Path, *arguments: str) -> str:
+    return python(folder, "-m", "agv_analysis.cli", *arguments)
+
+
+@pytest.mark.no_cover
+@pytest.mark.parametrize("kind", PARTS)
+def test_one_new_file_is_a_part(copied: Path, kind: str, tmp_path: Path) -> None:
+    file, source, settings, listed = PARTS[kind]
+    assert not (copied / file).exists()
+    (copied / file).write_text(source)
+    try:
+        assert listed in agv_ncs(copied, "parameters")
+        chosen = [word for setting in settings for word in ("--set", setting)]
+        lossy = () if kind == "channel" else ("--set", "relay.uplink.model=bernoulli", "--set", "relay.uplink.p=0.2")
+        out = tmp_path / "run.json"
+        agv_ncs(
+            copied, "simulate", "config/paper.yaml", *lossy, *chosen, "--set", "plant.duration=2.0", "--json", str(out)
+        )
+        found = json.loads(out.read_text())
+        assert found["steps"] == 400
+        assert found["loss_rate"] > 0.0
+        assert found["lifted_radius"] > 0.0
+    finally:
+        (copied / file).unlink()
+
+
+@pytest.mark.no_cover
+def test_one_new_file_is_a_criterion(copied: Path, tmp_path: Path) -> None:
+    """Terminal, JSON, report, explorer, sweep's border, map and margins show it."""
+    file = copied / "agv_analysis/stability/criteria/walker.py"
+    file.write_text(CRITERION)
+    out, page, table = tmp_path / "found.json", tmp_path / "report.html", tmp_path / "map.csv"
+    line = ("config/paper.yaml", "--set", "error_detector.track=line")
+    short = ("--set", "plant.duration=2.0")
+    try:
+        said = agv_ncs(copied, "simulate", *line, *short, "--json", str(out), "--report", str(page))
+        assert "Slower than a walker" in said
+        assert json.loads(out.read_text())["walker_top_speed"] == 1.0
+        assert "Slower than a walker" in page.read_text()
+        assert "Walker&#39;s speed" in page.read_text()
+        said = agv_ncs(copied, "stability", *line, *short, "--json", str(out))
+        assert "Walker's speed" in said
+        assert json.loads(out.read_text())["walker"] == {"speed": 1.6}
+        agv_ncs(
+            copied, "stability", *line, "--map", "kx,ts", "--points", "2", "--csv", str(table),
+            "--picture", str(tmp_path / "map.png"),
+        )  # fmt: skip
+        assert {row["n_walker"] for row in csv.DictReader(table.open())} == {"7"}
+        python(copied, "-c", PLACES)
+    finally:
+        file.unlink()
