@@ -24,6 +24,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
@@ -60,11 +61,16 @@ def verdict(loop: LinearLoop, n_max: int) -> BurstVerdict:
     lower = math.exp(growth[worst])
     if growth[worst] > MARGINAL:
         return BurstVerdict(n_max, UNSTABLE, lower, math.inf, worst, None)
+    upper, certificate = _upper_bound(loop, n_max)
+    return BurstVerdict(n_max, STABLE if upper < 1.0 else UNDECIDED, lower, upper, worst, certificate)
+
+
+def _upper_bound(loop: LinearLoop, n_max: int) -> tuple[float, Floats | None]:
+    """Upper bound on the growth per step under bursts up to `n_max`, and P of the norm behind it, if one is found."""
     certificate = _common_norm(_sample(loop, n_max + 1))
     if certificate is None:
-        return BurstVerdict(n_max, UNDECIDED, lower, math.inf, worst, None)
-    upper = math.exp(_worst_growth(loop, n_max + 1, certificate))
-    return BurstVerdict(n_max, STABLE if upper < 1.0 else UNDECIDED, lower, upper, worst, certificate)
+        return math.inf, None
+    return math.exp(_worst_growth(loop, n_max + 1, certificate)), certificate
 
 
 def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | None]:
@@ -77,7 +83,7 @@ def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | No
     proved, beyond = -1, limit + 1 if refuted is None else refuted
     attempt = beyond - 1  # just below what is refuted: nearly always proved at once
     while proved < beyond - 1:
-        if verdict(loop, attempt).verdict == STABLE:
+        if _upper_bound(loop, attempt)[0] < 1.0:
             proved = attempt
         else:
             beyond = attempt
@@ -144,17 +150,23 @@ def _sample(loop: LinearLoop, longest: int) -> Floats:
         return np.concatenate(list(burst_maps(loop, longest)))
     moving = np.flatnonzero(np.abs(loop.v_r) > 0.05 * loop.top_speed)
     moving = moving[:: max(1, len(moving) // 48)]
-    return np.concatenate([M[moving] for M in burst_maps(loop, longest)])
+    return np.concatenate(list(burst_maps(loop, longest, moving)))
 
 
 def _common_norm(maps: Floats) -> Floats | None:
     """P > 0 with M' P M < P for each of the maps, shape (M, m, m); None if the search ends without one.
 
-    The ellipsoid method with deep cuts (Bland, Goldfarb and Todd, Oper. Res. 29, 1981) over the entries of P. First P
-    without terms that couple along and across is searched for: it is a norm that never grows while the AGV is parked.
+    The ellipsoid method with deep cuts (Bland, Goldfarb and Todd, Oper. Res. 29, 1981) over the entries of P. Of the
+    three errors alone, first P without terms that couple along and across is searched for: it is a norm that never
+    grows while the AGV is parked. Further states change on other scales than the errors; they are measured by the
+    norm that the first of the maps has as Lyapunov function.
     """
     size = maps.shape[-1]
     entries = [(i, j) for i in range(size) for j in range(i, size)]
+    if size > _ERRORS:
+        root = _lyapunov_root(maps[0])
+        scaled = _ellipsoid(root @ maps @ np.linalg.inv(root), entries)
+        return None if scaled is None else np.asarray(root.T @ scaled @ root)
     apart = [(i, j) for i, j in entries if i > 0 or j == 0]
     for free in (apart, entries) if len(apart) < len(entries) else (entries,):
         found = _ellipsoid(maps, free)
@@ -163,16 +175,35 @@ def _common_norm(maps: Floats) -> Floats | None:
     return None
 
 
+_ERRORS = 3
+_LYAPUNOV_STEPS = 200
+
+
+def _lyapunov_root(M: Floats) -> Floats:
+    """R with R' R = sum over k of (M^k)' (M^k), the Lyapunov function of a map; the identity if it has none."""
+    P, power = np.zeros_like(M), np.eye(len(M))
+    for _ in range(_LYAPUNOV_STEPS):
+        P, power = P + power.T @ power, M @ power
+    if not np.isfinite(P).all() or np.linalg.cond(P) > 1e12:
+        return np.eye(len(M))
+    return np.asarray(np.linalg.cholesky(P).T)
+
+
 def _ellipsoid(maps: Floats, entries: list[tuple[int, int]]) -> Floats | None:
     n, size = len(entries), maps.shape[-1]
     basis = np.zeros((n, size, size))
     for entry, (i, j) in zip(basis, entries, strict=True):
         entry[i, j] = entry[j, i] = 1.0
     centre, shape = np.array([float(i == j) for i, j in entries]), 100.0 * np.eye(n)
+    some = np.arange(len(maps) if size <= _ERRORS else 0)
     for _ in range(150 * n):
-        cut = _violation(maps, np.tensordot(centre, basis, 1))
+        P = np.tensordot(centre, basis, 1)
+        cut = _violation(maps[some], P)
+        if cut is None and len(some) < len(maps):
+            some = np.union1d(some, _most_violated(maps, P))
+            cut = _violation(maps[some], P)
         if cut is None:
-            return np.asarray(np.tensordot(centre, basis, 1))
+            return np.asarray(P)
         outer, depth = cut
         slope = np.tensordot(basis, outer, 2)
         width = math.sqrt(max(0.0, float(slope @ shape @ slope)))
@@ -187,12 +218,25 @@ def _ellipsoid(maps: Floats, entries: list[tuple[int, int]]) -> Floats | None:
     return None
 
 
+_AT_ONCE = 16
+"""Maps that are looked at more often, from when they violate the norm the most: most of thousands never do."""
+
+
+def _most_violated(maps: Floats, P: Floats) -> NDArray[np.int64]:
+    """The maps, of all, that grow most in the norm x' P x; none if all shrink."""
+    growth = np.linalg.eigvalsh(np.swapaxes(maps, 1, 2) @ P @ maps - P)[:, -1]
+    worst = np.argsort(growth)[-_AT_ONCE:]
+    return np.asarray(worst[growth[worst] >= 0.0], dtype=np.int64)
+
+
 def _violation(maps: Floats, P: Floats) -> tuple[Floats, float] | None:
     """(W, depth) with trace(W P) = depth >= 0 although every solution has trace(W P) < 0; None if P is a solution."""
     values, vectors = np.linalg.eigh(P)
     if values[0] <= 1e-9 * values[-1]:
         x = vectors[:, 0]
         return -np.outer(x, x), float(max(0.0, -values[0]))
+    if not len(maps):
+        return None
     values, vectors = np.linalg.eigh(np.swapaxes(maps, 1, 2) @ P @ maps - P)
     worst = int(values[:, -1].argmax())
     if values[worst, -1] < 0.0:

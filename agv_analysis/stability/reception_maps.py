@@ -20,14 +20,18 @@ from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.products import multiply
 
 
-def burst_maps(loop: LinearLoop, longest: int) -> Iterator[Floats]:
-    """M_L for L = 1 .. longest, each of shape (R, m, m); row k is that of a burst that begins at step k of the lap."""
+def burst_maps(loop: LinearLoop, longest: int, begins: NDArray[np.int64] | None = None) -> Iterator[Floats]:
+    """M_L for L = 1 .. longest, each of shape (R, m, m); row k is that of a burst that begins at step k of the lap.
+
+    Or only of the bursts that begin at the steps `begins`, shape (B,): then of shape (B, m, m).
+    """
     F, G, H, K = loop.F, loop.G, loop.H, loop.K
     rows, m, q = G.shape
-    M = np.broadcast_to(np.eye(m), F.shape)
-    N = np.broadcast_to(np.eye(q, m), (rows, q, m))
+    first = np.arange(rows) if begins is None else begins
+    M = np.broadcast_to(np.eye(m), (len(first), m, m))
+    N = np.broadcast_to(np.eye(q, m), (len(first), q, m))
     for i in range(longest):
-        now = (np.arange(rows) + i) % rows
+        now = (first + i) % rows
         following = F[now] @ M
         if H is None:
             following[:, :, :q] += G[now]
