@@ -440,7 +440,7 @@ def test_a_schema_whose_lie_fits_the_bytes_has_another_hash(
     channel = record(4, struct.pack("<HH", 1, 1) + text("/a") + text("cdr") + struct.pack("<I", len(about)) + about)
     sent = record(5, struct.pack("<HIQQ", 1, 0, 1, 1) + b"\0\1\0\0" + struct.pack("<dd", 1.0, 2.0))
     bag = read(HEAD + schema + channel + sent + END)
-    assert any("not the hash recorded with it" in problem for problem in bag.problems) == is_found
+    assert any("does not match the recorded hash" in problem for problem in bag.problems) == is_found
 
 
 def test_messages_without_a_channel_are_counted(read: Callable[[bytes], Bag]) -> None:
