@@ -36,6 +36,12 @@ STABLE = "stable"
 UNSTABLE = "unstable"
 UNDECIDED = "undecided"
 
+_APART = 1e-12
+"""Entries of a step's matrix up to which it does not couple two states."""
+
+_ASKED, _ROUNDS = 24, 6
+"""Maps that a common norm is searched for at a time, and how often others are added to them, if P has many entries."""
+
 
 @dataclass(frozen=True)
 class BurstVerdict:
@@ -67,7 +73,7 @@ def verdict(loop: LinearLoop, n_max: int) -> BurstVerdict:
 
 def _upper_bound(loop: LinearLoop, n_max: int) -> tuple[float, Floats | None]:
     """Upper bound on the growth per step under bursts up to `n_max`, and P of the norm behind it, if one is found."""
-    certificate = _common_norm(_sample(loop, n_max + 1))
+    certificate = _common_norm(_sample(loop, n_max + 1), _along(loop))
     if certificate is None:
         return math.inf, None
     return math.exp(_worst_growth(loop, n_max + 1, certificate)), certificate
@@ -153,40 +159,42 @@ def _sample(loop: LinearLoop, longest: int) -> Floats:
     return np.concatenate(list(burst_maps(loop, longest, moving)))
 
 
-def _common_norm(maps: Floats) -> Floats | None:
+def _along(loop: LinearLoop) -> NDArray[np.bool_]:
+    """Which states go with x_e where the AGV moves and turns least, shape (m,): the drive's speed, say, if it lags."""
+    if loop.size <= 3:
+        return np.arange(loop.size) == 0
+    k = 0 if loop.is_constant else int(np.argmin(np.abs(loop.v_r) + np.abs(loop.w_r)))
+    coupling = np.abs(loop.F[k]) > _APART
+    coupling[:, : loop.outputs] |= np.abs(loop.G[k]) > _APART
+    coupling |= coupling.T | np.eye(loop.size, dtype=np.bool_)
+    along: NDArray[np.bool_] = np.arange(loop.size) == 0
+    for _ in range(loop.size):
+        along = np.asarray(coupling[along].any(axis=0), dtype=np.bool_)
+    return along
+
+
+def _common_norm(maps: Floats, along: NDArray[np.bool_]) -> Floats | None:
     """P > 0 with M' P M < P for each of the maps, shape (M, m, m); None if the search ends without one.
 
-    The ellipsoid method with deep cuts (Bland, Goldfarb and Todd, Oper. Res. 29, 1981) over the entries of P. Of the
-    three errors alone, first P without terms that couple along and across is searched for: it is a norm that never
-    grows while the AGV is parked. Further states change on other scales than the errors; they are measured by the
-    norm that the first of the maps has as Lyapunov function.
+    The ellipsoid method with deep cuts (Bland, Goldfarb and Todd, Oper. Res. 29, 1981) over the entries of P. First P
+    without terms that couple the states `along` the track with the others is searched for: it is a norm that never
+    grows while the AGV is parked. Where P has many entries, a few of the maps that span them all, and those that the P
+    found for these does not shrink, are asked.
     """
     size = maps.shape[-1]
     entries = [(i, j) for i in range(size) for j in range(i, size)]
-    if size > _ERRORS:
-        root = _lyapunov_root(maps[0])
-        scaled = _ellipsoid(root @ maps @ np.linalg.inv(root), entries)
-        return None if scaled is None else np.asarray(root.T @ scaled @ root)
-    apart = [(i, j) for i, j in entries if i > 0 or j == 0]
+    apart = [(i, j) for i, j in entries if along[i] == along[j]]
+    asked = np.arange(len(maps)) if size <= 3 else np.arange(0, len(maps), max(1, len(maps) // _ASKED))
     for free in (apart, entries) if len(apart) < len(entries) else (entries,):
-        found = _ellipsoid(maps, free)
-        if found is not None:
-            return found
+        for _ in range(_ROUNDS):
+            found = _ellipsoid(maps[asked], free)
+            if found is None:
+                break
+            growing = np.flatnonzero(_log_norms(maps, found) >= 0.0) if len(asked) < len(maps) else asked[:0]
+            if not len(growing):
+                return found
+            asked = np.union1d(asked, growing[:: max(1, len(growing) // _ASKED)])
     return None
-
-
-_ERRORS = 3
-_LYAPUNOV_STEPS = 200
-
-
-def _lyapunov_root(M: Floats) -> Floats:
-    """R with R' R = sum over k of (M^k)' (M^k), the Lyapunov function of a map; the identity if it has none."""
-    P, power = np.zeros_like(M), np.eye(len(M))
-    for _ in range(_LYAPUNOV_STEPS):
-        P, power = P + power.T @ power, M @ power
-    if not np.isfinite(P).all() or np.linalg.cond(P) > 1e12:
-        return np.eye(len(M))
-    return np.asarray(np.linalg.cholesky(P).T)
 
 
 def _ellipsoid(maps: Floats, entries: list[tuple[int, int]]) -> Floats | None:
@@ -195,15 +203,10 @@ def _ellipsoid(maps: Floats, entries: list[tuple[int, int]]) -> Floats | None:
     for entry, (i, j) in zip(basis, entries, strict=True):
         entry[i, j] = entry[j, i] = 1.0
     centre, shape = np.array([float(i == j) for i, j in entries]), 100.0 * np.eye(n)
-    some = np.arange(len(maps) if size <= _ERRORS else 0)
     for _ in range(150 * n):
-        P = np.tensordot(centre, basis, 1)
-        cut = _violation(maps[some], P)
-        if cut is None and len(some) < len(maps):
-            some = np.union1d(some, _most_violated(maps, P))
-            cut = _violation(maps[some], P)
+        cut = _violation(maps, np.tensordot(centre, basis, 1))
         if cut is None:
-            return np.asarray(P)
+            return np.asarray(np.tensordot(centre, basis, 1))
         outer, depth = cut
         slope = np.tensordot(basis, outer, 2)
         width = math.sqrt(max(0.0, float(slope @ shape @ slope)))
@@ -218,25 +221,12 @@ def _ellipsoid(maps: Floats, entries: list[tuple[int, int]]) -> Floats | None:
     return None
 
 
-_AT_ONCE = 16
-"""Maps that are looked at more often, from when they violate the norm the most: most of thousands never do."""
-
-
-def _most_violated(maps: Floats, P: Floats) -> NDArray[np.int64]:
-    """The maps, of all, that grow most in the norm x' P x; none if all shrink."""
-    growth = np.linalg.eigvalsh(np.swapaxes(maps, 1, 2) @ P @ maps - P)[:, -1]
-    worst = np.argsort(growth)[-_AT_ONCE:]
-    return np.asarray(worst[growth[worst] >= 0.0], dtype=np.int64)
-
-
 def _violation(maps: Floats, P: Floats) -> tuple[Floats, float] | None:
     """(W, depth) with trace(W P) = depth >= 0 although every solution has trace(W P) < 0; None if P is a solution."""
     values, vectors = np.linalg.eigh(P)
     if values[0] <= 1e-9 * values[-1]:
         x = vectors[:, 0]
         return -np.outer(x, x), float(max(0.0, -values[0]))
-    if not len(maps):
-        return None
     values, vectors = np.linalg.eigh(np.swapaxes(maps, 1, 2) @ P @ maps - P)
     worst = int(values[:, -1].argmax())
     if values[worst, -1] < 0.0:

@@ -36,7 +36,7 @@ _LARGEST = 400
 """Size of the recursion's matrix up to which its eigenvalues are asked for instead of driving laps."""
 
 _STEPS = 2000
-"""Steps that a loop is driven at once which is the same at every step."""
+"""A loop that is the same at every step is driven so many at once, a shorter lap several times."""
 
 MOST_LOST = 0.9999
 """Largest loss probability that is asked for behind a predictor, which may make any of them harmless."""
@@ -125,7 +125,7 @@ def settled_growth(
 
     `drive` sends them through so many steps in place, to be multiplied by exp(what it returns); `size` is theirs.
     """
-    steps, growth = _STEPS if loop.is_constant else loop.steps, math.nan
+    steps, growths = _STEPS if loop.is_constant else math.ceil(_STEPS / loop.steps) * loop.steps, [math.nan]
     for _ in range(_LAPS):
         log_scale, size_now = drive(steps), size()
         if not size_now > 0.0:
@@ -135,10 +135,10 @@ def settled_growth(
         # From one lap to the next the moments keep their proportions in the end, so their size says it all.
         for part in moments:
             part /= size_now
-        before, growth = growth, log_scale + math.log(size_now)
-        if abs(growth - before) <= 1e-8 * max(1.0, abs(growth)):
-            break
-    return growth * (loop.steps / steps)
+        growths.append(log_scale + math.log(size_now))
+        if abs(growths[-1] - growths[-2]) <= 1e-8 * max(1.0, abs(growths[-1])):
+            return growths[-1] * (loop.steps / steps)
+    return float(np.mean(growths[_LAPS // 2 :])) * (loop.steps / steps)  # without losses a complex pair never settles
 
 
 def _drive_lap(

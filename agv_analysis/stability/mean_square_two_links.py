@@ -22,6 +22,7 @@ loop Schenato et al., Foundations of control and estimation over lossy networks,
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -57,6 +58,50 @@ def independent(uplink: Chain, downlink: Chain) -> JointChain:
     u, d = (grid.ravel() for grid in np.meshgrid(uplink.delivery, downlink.delivery, indexing="ij"))
     outcomes = [(u if pose else 1.0 - u) * (d if command else 1.0 - d) for pose, command in _OUTCOMES]
     return JointChain(np.asarray(np.kron(uplink.transition, downlink.transition)), np.stack(outcomes, axis=1))
+
+
+def correlated(uplink: Chain, downlink: Chain, share: float) -> JointChain:
+    """Links of which the downlink draws the uplink's random numbers in a `share` of the slots, as the relay's do.
+
+    A message is delivered if a number in [0, 1) is below g, and a channel leaves its state if another one is below the
+    probability of that. A state is one of both channels and whether their numbers are the same in this slot. For
+    channels of at most two states, and for those whose transitions are certain.
+    """
+    apart = independent(uplink, downlink)
+    if share == 0.0:
+        return apart
+    pairs = list(itertools.product(range(len(uplink.delivery)), range(len(downlink.delivery))))
+    outcomes = [_alike(_delivered_first(uplink, i), _delivered_first(downlink, j)).ravel() for i, j in pairs]
+    moves = []
+    for i, j in pairs:
+        to_up, to_down = _leaving_first(uplink, i), _leaving_first(downlink, j)
+        move = np.zeros((len(uplink.delivery), len(downlink.delivery)))
+        move[np.ix_(to_up, to_down)] = _alike(uplink.transition[i, to_up], downlink.transition[j, to_down])
+        moves.append(move.ravel())
+    of_coin = np.array([1.0 - share, share])
+    transition = np.concatenate((apart.transition, np.array(moves)))
+    return JointChain(
+        np.hstack([chance * transition for chance in of_coin]), np.concatenate((apart.outcomes, outcomes))
+    )
+
+
+def _delivered_first(chain: Chain, state: int) -> Floats:
+    return np.array([chain.delivery[state], 1.0 - chain.delivery[state]])
+
+
+def _leaving_first(chain: Chain, state: int) -> list[int]:
+    """The states after `state`, itself as the last."""
+    return [other for other in range(len(chain.delivery)) if other != state] + [state]
+
+
+def _alike(first: Floats, second: Floats) -> Floats:
+    """P(a, b) of two events decided by the same number in [0, 1): that falls into part a of one, part b of the other.
+
+    Lengths of the parts, shapes (m,) and (n,), in order; shape (m, n).
+    """
+    ends, others = np.cumsum(first), np.cumsum(second)
+    below = np.minimum(ends[:, None], others)  # P(part a or one before, part b or one before)
+    return np.asarray(np.diff(np.diff(below, axis=0, prepend=0.0), axis=1, prepend=0.0))
 
 
 def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> float:

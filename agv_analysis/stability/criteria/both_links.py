@@ -22,12 +22,10 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
         reason = "no answer: a channel is no finite Markov chain"
     elif policy not in mean_square_two_links.POLICIES:
         reason = f"no answer: computed for a plant that holds its command or stops, not for {policy}"
-    elif relay.downlink.correlation != 0.0:
-        reason = "no answer: computed for links that lose independently of each other"
     if reason or uplink is None or downlink is None:
         yield Margin(name, label, None, reason=reason)
         return
-    links = mean_square_two_links.independent(uplink, downlink)
+    links = mean_square_two_links.correlated(uplink, downlink, relay.downlink.correlation)
     growth = mean_square_two_links.lap_growth(facts.loop, links, policy == "zero") / facts.loop.steps
     word = "dies out" if growth < 0.0 else "grows"
     yield Margin(name, label, growth, f"E[e^2] {word}, times {math.exp(growth):.6g} a step")
@@ -38,7 +36,7 @@ CRITERION = Criterion(
     order=60,
     title="Both links, mean square",
     asks="Does E[|e|^2] die out if commands are lost as well as poses?",
-    assumes="Two finite Markov chains that lose independently, and a plant that holds its command or stops.",
+    assumes="Links that are finite Markov chains, apart or with common random numbers; a plant that holds or stops.",
     margins=_margins,
     margin_names=(("both_links.mean_square_growth", "Both links as they are, mean square"),),
 )

@@ -16,8 +16,10 @@ from agv_analysis.simulation import simulate_batch
 from agv_analysis.stability import mean_square, mean_square_two_links
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.margins import margins
-from agv_analysis.stability.mean_square_two_links import independent
+from agv_analysis.stability.mean_square_two_links import correlated, independent
 from agv_cloud.parameters import ControllerParameters
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.link import losses
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
 TS = 0.005
@@ -125,6 +127,51 @@ def test_simulated_twins_on_both_sides_of_the_border(p: float, contracts: bool) 
     assert (square < 1e-3) if contracts else (square > 1e3)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_links_that_share_random_numbers_lose_as_those_of_the_relay(share: float) -> None:
+    """Rates of the outcomes of one slot and of two slots in a row, in 400 000 slots; five standard errors are 0.006."""
+    up = ChannelParameters(model="gilbert_elliott", p=0.2, r=0.4, h=0.1, k=0.95)
+    down = ChannelParameters(model="gilbert_elliott", p=0.3, r=0.5, h=0.0, k=0.9, correlation=share)
+    lost = [losses(channel, 5, stream, 400_000) for channel, stream in ((up, "uplink"), (down, "downlink"))]
+    seen = 2 * lost[0] + lost[1]
+    chains = gilbert_elliott(0.2, 0.4, 0.1, 0.95), gilbert_elliott(0.3, 0.5, 0.0, 0.9)
+    transition, outcomes = correlated(*chains, share)
+    np.testing.assert_allclose(transition.sum(axis=1), 1.0, rtol=1e-12)
+    stationary = np.linalg.matrix_power(transition, 1000)[0]
+    once = stationary @ outcomes
+    np.testing.assert_allclose(np.bincount(seen, minlength=4) / 400_000, once, atol=0.006)
+    twice = np.einsum("s,so,st,tq->oq", stationary, outcomes, transition, outcomes)
+    found = np.bincount(4 * seen[:-1] + seen[1:], minlength=16) / 399_999
+    np.testing.assert_allclose(found, twice.ravel(), atol=0.006)
+
+
+def test_links_that_share_nearly_nothing_are_nearly_independent() -> None:
+    chains = gilbert_elliott(0.2, 0.4), bernoulli(0.3)
+    truth = mean_square_two_links.lap_growth(ONE, independent(*chains))
+    assert mean_square_two_links.lap_growth(ONE, correlated(*chains, 0.0)) == truth
+    assert mean_square_two_links.lap_growth(ONE, correlated(*chains, 1e-9)) == pytest.approx(truth, abs=1e-7)
+
+
+def test_links_that_fail_together_are_easier_to_bear() -> None:
+    """Half of all lost on both: K_x between the borders, stable only if they share their fate; twins confirm it."""
+    loop = straight(ControllerParameters(kx=110.0))
+    chains = bernoulli(0.5), bernoulli(0.5)
+    apart, together = (mean_square_two_links.lap_growth(loop, correlated(*chains, share)) for share in (0.0, 1.0))
+    assert together < -0.005 < 0.01 < apart
+    settings = [
+        "error_detector.track=line", "controller.kx=110.0", f"plant.initial_pose=[0.0, 0.0, {math.pi / 2}]",
+        "plant.duration=5.0", "relay.uplink.model=bernoulli", "relay.uplink.p=0.5", "relay.downlink.model=bernoulli",
+        "relay.downlink.p=0.5",
+    ]  # fmt: skip
+    squares = [
+        np.mean(simulate_batch([load_scenario(PAPER, [*settings, f"relay.downlink.correlation={share}"])],
+                               range(1, 401), twins=True)["contraction"] ** 2)
+        for share in (0.0, 1.0)
+    ]  # fmt: skip
+    assert squares[1] < 1e-3
+    assert squares[0] > 1.0
+
+
 def test_the_margins_have_it_where_commands_are_lost() -> None:
     lossy = ("relay.uplink.model=bernoulli", "relay.uplink.p=0.5", "relay.downlink.model=bernoulli")
     line = ("error_detector.track=line", "relay.downlink.p=0.6")
@@ -139,7 +186,6 @@ def test_the_margins_have_it_where_commands_are_lost() -> None:
     ("setting", "reason"),
     [
         ("plant.downlink_policy=ramp", "not for ramp"),
-        ("relay.downlink.correlation=0.5", "independently"),
         ("relay.downlink.p=0.0", "loses nothing"),
     ],
 )
