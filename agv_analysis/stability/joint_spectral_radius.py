@@ -161,13 +161,13 @@ def _sample(loop: LinearLoop, longest: int) -> Floats:
 
 def _along(loop: LinearLoop) -> NDArray[np.bool_]:
     """Which states go with x_e where the AGV moves and turns least, shape (m,): the drive's speed, say, if it lags."""
+    along: NDArray[np.bool_] = np.arange(loop.size) == 0
     if loop.size <= 3:
-        return np.arange(loop.size) == 0
+        return along
     k = 0 if loop.is_constant else int(np.argmin(np.abs(loop.v_r) + np.abs(loop.w_r)))
     coupling = np.abs(loop.F[k]) > _APART
     coupling[:, : loop.outputs] |= np.abs(loop.G[k]) > _APART
     coupling |= coupling.T | np.eye(loop.size, dtype=np.bool_)
-    along: NDArray[np.bool_] = np.arange(loop.size) == 0
     for _ in range(loop.size):
         along = np.asarray(coupling[along].any(axis=0), dtype=np.bool_)
     return along

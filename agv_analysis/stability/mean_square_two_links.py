@@ -78,11 +78,9 @@ def correlated(uplink: Chain, downlink: Chain, share: float) -> JointChain:
         move = np.zeros((len(uplink.delivery), len(downlink.delivery)))
         move[np.ix_(to_up, to_down)] = _alike(uplink.transition[i, to_up], downlink.transition[j, to_down])
         moves.append(move.ravel())
-    of_coin = np.array([1.0 - share, share])
-    transition = np.concatenate((apart.transition, np.array(moves)))
-    return JointChain(
-        np.hstack([chance * transition for chance in of_coin]), np.concatenate((apart.outcomes, outcomes))
-    )
+    moved = np.concatenate((apart.transition, np.array(moves)))
+    transition = np.hstack(((1.0 - share) * moved, share * moved))
+    return JointChain(transition, np.concatenate((apart.outcomes, outcomes)))
 
 
 def _delivered_first(chain: Chain, state: int) -> Floats:
