@@ -27,7 +27,8 @@ GAINS_UNKNOWN = "the controller's gains are not known: name its params file with
 _OF_GAINS = (
     "paper_stable", "paper_radius", "lifted_stable", "lifted_radius", "bursts_stable", "bursts_verdict",
     "bursts_radius_lower", "bursts_radius_upper", "mean_square_stable", "mean_square_growth",
-    "floquet_multiplier_per_step", "contraction_per_step", "verdict", "verdict_criterion", "margin",
+    "floquet_multiplier_per_step", "contraction_per_step", "verdict", "verdict_criterion", "margin", "feasible",
+    "infeasible_reason", "nominal_notes",
 )  # fmt: skip
 """Figures that nobody knows without the gains."""
 

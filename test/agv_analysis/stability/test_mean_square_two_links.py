@@ -19,7 +19,7 @@ from agv_analysis.stability.margins import margins
 from agv_analysis.stability.mean_square_two_links import correlated, independent
 from agv_cloud.parameters import ControllerParameters
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.link import losses
+from agv_plant.radio.channel import losses
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
 TS = 0.005

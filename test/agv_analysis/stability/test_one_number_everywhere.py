@@ -94,6 +94,7 @@ def test_the_border_of_a_sweep_is_that_of_the_margins() -> None:
     base = load_scenario(PAPER, settings)
     p = margins(base).p_mean_square
     a = 0.005 * 25.0 * 1.3
+    assert p is not None
     assert p == pytest.approx((2.0 - a) / (2.0 + a), rel=1e-6)
     axis = (parse_axis("relay.uplink.p=0.1,0.9"),)
     below, above = border_margins(base, axis, [(p - 1e-5,), (p + 1e-5,)])["mean square"]
