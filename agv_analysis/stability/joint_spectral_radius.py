@@ -74,9 +74,10 @@ def verdict(loop: LinearLoop, n_max: int) -> BurstVerdict:
 def _upper_bound(loop: LinearLoop, n_max: int) -> tuple[float, Floats | None]:
     """Upper bound on the growth per step under bursts up to `n_max`, and P of the norm behind it, if one is found."""
     certificate = _common_norm(_sample(loop, n_max + 1), _along(loop))
-    if certificate is None:
-        return math.inf, None
-    return math.exp(_worst_growth(loop, n_max + 1, certificate)), certificate
+    bound = math.inf if certificate is None else math.exp(_worst_growth(loop, n_max + 1, certificate))
+    if n_max == 0 and bound >= 1.0:  # without losses there is one sequence only, whose growth is the bound
+        return math.exp(next(_repeated_growths(loop, 1))), None
+    return bound, certificate
 
 
 def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | None]:

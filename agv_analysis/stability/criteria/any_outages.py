@@ -50,7 +50,8 @@ def _judge(facts: RunFacts) -> Judgement | None:
 
 def _why(found: BurstVerdict) -> str:
     if found.verdict == joint_spectral_radius.STABLE:
-        return f"joint spectral radius at most {found.upper:.6g}, proved by a common norm"
+        proof = "proved by a common norm" if found.certificate is not None else "of the one sequence without outages"
+        return f"joint spectral radius at most {found.upper:.6g}, {proof}"
     if found.verdict == UNSTABLE:
         return f"outages of {found.worst} slots grow by {found.lower:.6g} a step"
     return f"joint spectral radius at least {found.lower:.6g}"

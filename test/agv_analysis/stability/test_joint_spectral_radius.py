@@ -254,3 +254,15 @@ def test_degenerate_gains(lap: Lap) -> None:
     assert found(0.0)[0] == -1  # what is off along the track stays off
     assert found(200.0) == (0, 1)  # deadbeat
     assert found(401.0) == (-1, 0)
+
+
+def test_without_outages_there_is_one_sequence_and_no_norm_is_needed() -> None:
+    """A lap on two steps: each alone grows in every common norm, their product does not."""
+    up, down = np.diag([2.0, 0.25, 0.5]), np.diag([0.25, 2.0, 0.5])
+    loop = LinearLoop(
+        TS, np.ones(2), np.zeros(2), A=np.array([up, down]), B=np.zeros((2, 3, 2)), D=np.zeros((2, 3, 3)),
+        L_h=np.zeros((2, 2, 3)), L_z=np.zeros((2, 2, 3)),
+    )  # fmt: skip
+    found = verdict(loop, 0)
+    assert (found.verdict, found.certificate) == (STABLE, None)
+    assert found.lower == found.upper == pytest.approx(math.sqrt(0.5), rel=1e-12)
