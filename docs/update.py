@@ -19,6 +19,7 @@ DEMO = "<!-- demo:begin -->\n", "<!-- demo:end -->"
 RANKING = "<!-- ranking:begin -->\n", "<!-- ranking:end -->"
 NAMES = "<!-- names:begin -->\n", "<!-- names:end -->"
 TYPES = "<!-- types:begin -->\n", "<!-- types:end -->"
+CRITERIA_TABLE = "<!-- criteria:begin -->\n", "<!-- criteria:end -->"
 
 
 def command(*arguments: str) -> str:
@@ -59,6 +60,16 @@ def policies_page() -> str:
 
     text = (REPOSITORY / "docs/policies.md").read_text(encoding="utf-8")
     return between(*RANKING, "\n".join(map(table_markdown, policy_tables())), text)
+
+
+def stability_page() -> str:
+    """docs/stability.md with its table of criteria made anew."""
+    from agv_analysis.stability.criteria import CRITERIA
+
+    rows = ["| key | asks | takes for granted |", "| --- | --- | --- |"]
+    rows += [f"| `{one.key}` | {escaped(one.asks)} | {escaped(one.assumes)} |" for one in CRITERIA]
+    text = (REPOSITORY / "docs/stability.md").read_text(encoding="utf-8")
+    return between(*CRITERIA_TABLE, "\n".join(rows) + "\n", text)
 
 
 def python_api_page() -> str:
@@ -151,6 +162,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         (REPOSITORY / "docs/paper.md").write_text(paper_page(folder), encoding="utf-8")
     (REPOSITORY / "docs/policies.md").write_text(policies_page(), encoding="utf-8")
+    (REPOSITORY / "docs/stability.md").write_text(stability_page(), encoding="utf-8")
     (REPOSITORY / "docs/python_api.md").write_text(python_api_page(), encoding="utf-8")
     (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
     (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")

@@ -27,6 +27,10 @@ def test_the_page_of_parameters_is_current(update: Any) -> None:
     assert update.parameters_page() == (REPOSITORY / "docs/parameters.md").read_text()
 
 
+def test_the_table_of_criteria_is_current(update: Any) -> None:
+    assert update.stability_page() == (REPOSITORY / "docs/stability.md").read_text()
+
+
 def test_the_page_of_the_python_api_is_current(update: Any) -> None:
     assert update.python_api_page() == (REPOSITORY / "docs/python_api.md").read_text()
 

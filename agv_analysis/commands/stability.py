@@ -132,11 +132,13 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
         return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
     if chain.loss_rate >= 1.0:
         return {}, {"best_kx": "no answer: the scenario's uplink loses everything"}
-    loop = straight_loop_of(scenario)
-    a = None if loop is None else loop.along_gain
-    if scenario.controller.law != KANAYAMA or a is None or a <= 0.0:
+    # With a gain of 1 the loop's a is how far a commanded speed of 1 m/s moves the AGV in a step, whatever its own gain.
+    unit = dataclasses.replace(scenario, controller=dataclasses.replace(scenario.controller, kx=1.0))
+    loop = straight_loop_of(unit) if scenario.controller.law == KANAYAMA else None
+    advance = None if loop is None else loop.along_gain
+    if advance is None or advance <= 0.0:
         return {}, {"best_kx": "no answer: computed for Kanayama's law and a drive that obeys at once"}
-    return best_kx(chain, a / scenario.controller.kx), {"almost_sure": WHY_A_TOLERANCE}
+    return best_kx(chain, advance), {"almost_sure": WHY_A_TOLERANCE}
 
 
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:
