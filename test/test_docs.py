@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from agv_cloud.control.registry import CONTROL_LAWS
+from agv_cloud.staleness.registry import STALENESS_POLICIES
+from agv_plant.vehicle.registry import VEHICLES
+from agv_ros.parts import Registry
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -33,6 +39,21 @@ def test_the_table_of_criteria_is_current(update: Any) -> None:
 
 def test_the_page_of_the_python_api_is_current(update: Any) -> None:
     assert update.python_api_page() == (REPOSITORY / "docs/python_api.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("page", "registry"),
+    [("control_laws", CONTROL_LAWS), ("plant", VEHICLES), ("policies", STALENESS_POLICIES)],
+)
+def test_a_page_has_a_row_for_every_part_with_its_parameters(page: str, registry: Registry) -> None:
+    rows = (REPOSITORY / f"docs/{page}.md").read_text()
+    for name in registry.own:
+        row = re.findall(rf"^\| `{name}` \|.*$", rows, re.MULTILINE)[0]
+        for known in registry.find(name).parameters:
+            default = ".inf" if known.default == math.inf else f"{known.default:g}"
+            assert re.search(rf"`(?:{name})?\.?{known.name}`[^`]* {re.escape(f'{known.unit} {default}')}\b", row), (
+                known.name
+            )
 
 
 @pytest.mark.no_cover

@@ -158,10 +158,14 @@ np.save(sys.argv[2], rows)
 """
 
 
-def from_csv(file: Path) -> NDArray[np.float64]:
-    table = np.genfromtxt(file, delimiter=",", names=True, dtype=None, encoding="utf-8")
-    names = ("x_c", "y_c", "theta_c", "x_e", "y_e", "theta_e", "v", "w", "lost")
-    return np.column_stack([table[name] for name in names]).astype(float)
+SIMULATE = """
+import sys
+import numpy as np
+from agv_analysis.scenario import load_scenario
+from agv_analysis.simulation import simulate
+run = simulate(load_scenario(sys.argv[1], sys.argv[3:]))
+np.save(sys.argv[2], np.column_stack([run.pose, run.error, run.command, run.lost]))
+"""
 
 
 def assert_same(found: NDArray[np.float64], given: Given) -> None:
@@ -176,16 +180,23 @@ def assert_same(found: NDArray[np.float64], given: Given) -> None:
 def test_nodes_simulation_and_recording_do_what_is_written_here(
     package: dict[str, str], tmp_path: Path, given: Given
 ) -> None:
-    bag, rows, table = tmp_path / "bag", tmp_path / "rows.npy", tmp_path / "run.csv"
+    bag, recorded, simulated = tmp_path / "bag", tmp_path / "recorded.npy", tmp_path / "simulated.npy"
     cli(package, "run", PAPER, *given.options, "--bag", bag)
-    python(package, "-c", READ, str(bag), str(rows))
-    assert_same(np.load(rows), given)
-    cli(package, "simulate", PAPER, *given.options, "--csv", table)
-    assert_same(from_csv(table), given)
-    said = cli(package, "replay", bag, "--compare")
-    assert said.count("equal (largest difference") == 2
-    said = cli(package, "analyse", bag, "--json", tmp_path / "found.json")
-    assert json.loads((tmp_path / "found.json").read_text())["steps"] == STEPS
+    python(package, "-c", READ, str(bag), str(recorded))
+    assert_same(np.load(recorded), given)
+    python(package, "-c", SIMULATE, PAPER, str(simulated), *given.settings)
+    assert_same(np.load(simulated), given)
+    assert cli(package, "replay", bag, "--compare").count("equal (largest difference") == 2
+
+
+def test_a_recording_is_judged(package: dict[str, str], tmp_path: Path) -> None:
+    bag, short = tmp_path / "bag", ("--set", "plant.duration=0.5")
+    cli(package, "run", PAPER, *AHEAD.options, *short, "--bag", bag)
+    assert "Verdict" in cli(package, "analyse", bag, "--json", tmp_path / "found.json")
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert (found["steps"], found["unexplained"]) == (100, {})
+    assert found["verdict"] is not None
+    assert "Verdict" in cli(package, "simulate", PAPER, *AHEAD.options, *short)
 
 
 def test_the_loop_in_processes_and_a_replay_on_dds_have_the_policy_s_commands(
@@ -202,10 +213,9 @@ def test_late_messages_go_another_way_through_the_simulation_to_the_same_numbers
     package: dict[str, str], tmp_path: Path
 ) -> None:
     """A jitter of nothing: links are asked slot by slot, memories and states are kept by them."""
-    table = tmp_path / "run.csv"
-    later = ["--set", "relay.downlink.delay=0.0001", "--set", "relay.downlink.schedule=0.0: delay=0.0"]
-    cli(package, "simulate", PAPER, *ALL.options, *later, "--csv", table)
-    assert_same(from_csv(table), ALL)
+    rows, later = tmp_path / "rows.npy", ["relay.downlink.delay=0.0001", "relay.downlink.schedule=0.0: delay=0.0"]
+    python(package, "-c", SIMULATE, PAPER, str(rows), *ALL.settings, *later)
+    assert_same(np.load(rows), ALL)
 
 
 BATCH = """
