@@ -78,8 +78,8 @@ def test_a_law_that_is_wrong_is_refused_when_it_is_chosen_and_disturbs_no_other(
 ) -> None:
     environment = install(tmp_path, {"wrong": code}, {LAWS: {"mine": "wrong:mine"}})
     assert said in refusal(agv_ncs("simulate", PAPER, *SHORT, *LAW, *settings, env=environment))
-    status, found = agv_ncs("simulate", PAPER, *SHORT, env=environment)
-    assert status == 0, found
+    status, found = agv_ncs("parameters", env=environment)
+    assert (status, "control law state_feedback" in found) == (0, True), found
 
 
 def test_names_that_are_taken_are_refused(install: Install, agv_ncs: AgvNcs, tmp_path: Path) -> None:
@@ -102,6 +102,8 @@ def test_names_that_are_taken_are_refused(install: Install, agv_ncs: AgvNcs, tmp
     assert "two control laws are called mine: laws:one of another package and laws:other of another" in said("mine")
     status, found = agv_ncs("parameters", env=environment)
     assert (status, "v_max.k" in found, "Traceback" in found) == (0, False, False)
+    status, found = agv_ncs("simulate", PAPER, *SHORT, env=environment)
+    assert status == 0, found
     params = tmp_path / "params.yaml"
     params.write_text("controller: {ros__parameters: {law: mine, mine: {k: 2.0}}}")
     assert "two control laws are called mine" in refusal(agv_ncs("simulate", params, *SHORT, env=environment))
