@@ -132,7 +132,7 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
         return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
     if chain.loss_rate >= 1.0:
         return {}, {"best_kx": "no answer: the scenario's uplink loses everything"}
-    # With a gain of 1 the loop's a is how far a commanded speed of 1 m/s moves the AGV in a step, whatever its own gain.
+    # With a gain of 1 the loop's a is how far a commanded speed of 1 m/s moves the AGV in a step.
     unit = dataclasses.replace(scenario, controller=dataclasses.replace(scenario.controller, kx=1.0))
     loop = straight_loop_of(unit) if scenario.controller.law == KANAYAMA else None
     advance = None if loop is None else loop.along_gain
