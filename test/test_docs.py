@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import math
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,6 +69,17 @@ def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> N
     update.command("run", "config/outages.yaml", "--bag", bag)
     block = update.demo_block(update.command("analyse", bag))
     assert block in (REPOSITORY / "README.md").read_text()
+
+
+def test_the_python_of_the_readme_runs() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+    short = code.replace('["controller.law', '["plant.duration=5.0", "controller.law')
+    assert short != code
+    result = subprocess.run(
+        [sys.executable, "-c", short], cwd=REPOSITORY, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert result.returncode == 0, result.stderr
+    assert re.fullmatch(r"[a-z-]+ \d+\n", result.stdout), result.stdout
 
 
 def test_the_commands_of_the_readme_exist(agv_ncs: Callable[..., tuple[int, str]]) -> None:

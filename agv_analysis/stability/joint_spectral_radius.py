@@ -228,13 +228,14 @@ def _violation(maps: Floats, P: Floats) -> tuple[Floats, float] | None:
     if values[0] <= 1e-9 * values[-1]:
         x = vectors[:, 0]
         return -np.outer(x, x), float(max(0.0, -values[0]))
-    values, vectors = np.linalg.eigh(np.swapaxes(maps, 1, 2) @ P @ maps - P)
-    worst = int(values[:, -1].argmax())
-    if values[worst, -1] < 0.0:
+    differences = np.swapaxes(maps, 1, 2) @ P @ maps - P
+    worst = int(_largest_eigenvalues(differences).argmax())
+    values, vectors = np.linalg.eigh(differences[worst])
+    if values[-1] < 0.0:
         return None
-    x = vectors[worst, :, -1]
+    x = vectors[:, -1]
     y = maps[worst] @ x
-    return np.outer(y, y) - np.outer(x, x), float(values[worst, -1])
+    return np.outer(y, y) - np.outer(x, x), float(values[-1])
 
 
 def _worst_growth(loop: LinearLoop, longest: int, P: Floats) -> float:
