@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
+from agv_analysis.stability.kanayama_delay import KanayamaGains
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import log_spectral_radius
 from agv_analysis.stability.reception_maps import burst_maps
-from agv_cloud.parameters import ControllerParameters
 
 STABLE = "stable"
 UNSTABLE = "unstable"
@@ -119,7 +119,7 @@ def largest_n_along(a: float) -> int | None:
     return None if a == 0.0 else max(-1, math.ceil(2.0 / a) - 2)
 
 
-def largest_n_across(v: float, gains: ControllerParameters, ts: float) -> int | None:
+def largest_n_across(v: float, gains: KanayamaGains, ts: float) -> int | None:
     """Largest n whose repetition contracts across a straight track at the constant speed `v` > 0 [m/s].
 
     -1 if not even a loop without losses contracts, None if there is no limit.

@@ -18,13 +18,12 @@ from __future__ import annotations
 
 import cmath
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
-from agv_cloud.parameters import ControllerParameters
 
 Complexes = NDArray[np.complex128]
 
@@ -34,12 +33,28 @@ _ANGLES = (0.3, 0.8, 1.3, 1.57, 2.2, 3.0, 4.5, 7.0, 10.0)
 _ITERATIONS = 60
 
 
-def spectral_radius(n: int, v_r: float, w_r: float, gains: ControllerParameters, ts: float) -> float:
+class KanayamaGains(Protocol):
+    """Whatever has the gains of Kanayama's law: the controller's parameters, a point of a map."""
+
+    @property
+    def kx(self) -> float:
+        """K_x [1/s]."""
+
+    @property
+    def ky(self) -> float:
+        """K_y [1/m^2]."""
+
+    @property
+    def ktheta(self) -> float:
+        """K_theta [1/m]."""
+
+
+def spectral_radius(n: int, v_r: float, w_r: float, gains: KanayamaGains, ts: float) -> float:
     """Largest modulus of a multiplier for constant n at the speeds v_r [m/s], w_r [rad/s]; neutral ones left out."""
     return float(spectral_radii(n, np.array([v_r]), np.array([w_r]), gains, ts)[0])
 
 
-def spectral_radii(n: int, v_r: Floats, w_r: Floats, gains: ControllerParameters, ts: float) -> Floats:
+def spectral_radii(n: int, v_r: Floats, w_r: Floats, gains: KanayamaGains, ts: float) -> Floats:
     """As `spectral_radius` for speeds of shape (N,), shape (N,)."""
     a = np.full(len(v_r), ts * gains.kx)
     b, c = ts * gains.ktheta * v_r, ts * ts * gains.ky * v_r * v_r
@@ -142,7 +157,7 @@ def critical_delay_along(a: float) -> float:
     return 0.5 * (math.pi / (2.0 * math.asin(0.5 * a)) - 1.0) if 0.0 < a < 2.0 else 0.0
 
 
-def critical_delay_across(v: float, gains: ControllerParameters, ts: float) -> float:
+def critical_delay_across(v: float, gains: KanayamaGains, ts: float) -> float:
     """As `critical_delay_along`, across a straight track at the constant speed `v` [m/s]; inf when parked.
 
     On |z| = 1 the roots of (z-1)^2 + b u (z-1) + c u = 0, u = z^-n, need x = |z-1|^2 with x^2 = b (b - c) x + c^2. This

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from agv_analysis.stability.joint_spectral_radius import largest_n_across, largest_n_along
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, radii_of
-from agv_cloud.parameters import ControllerParameters
 
 Ints = NDArray[np.int64]
 
@@ -44,18 +43,13 @@ class Point(NamedTuple):
         """T_s K_x."""
         return self.ts * self.kx
 
-    @property
-    def gains(self) -> ControllerParameters:
-        """The gains as parameters of the controller."""
-        return ControllerParameters(kx=self.kx, ky=self.ky, ktheta=self.ktheta)
-
 
 def largest_repeated_burst(point: Point) -> int:
     """Largest n such that bursts of n losses, again and again, contract on a straight track."""
     along = largest_n_along(point.a)
     if along is None:  # K_x = 0: what is off along the track stays off
         return -1
-    across = LIMIT if point.v == 0.0 else largest_n_across(point.v, point.gains, point.ts)
+    across = LIMIT if point.v == 0.0 else largest_n_across(point.v, point, point.ts)
     return min(along, LIMIT if across is None else across)
 
 
@@ -78,7 +72,7 @@ def largest_delays(points: Sequence[Point]) -> Ints:
 
 def _on_a_straight_track(point: Point) -> int:
     along = critical_delay_along(point.a)
-    across = critical_delay_across(abs(point.v), point.gains, point.ts) if point.v >= 0.0 else 0.0
+    across = critical_delay_across(abs(point.v), point, point.ts) if point.v >= 0.0 else 0.0
     # A delay that is a whole number is marginal itself; 1e-9 is more than rounding makes of it.
     return max(-1, math.ceil(min(along, across, LIMIT) - 1e-9) - 1)
 

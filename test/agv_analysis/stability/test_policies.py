@@ -154,7 +154,7 @@ def test_aligned_poses_have_the_margins_of_held_ones() -> None:
 def test_a_faster_plant_is_a_larger_gain() -> None:
     """To an edge that holds or aligns, a speed of twice the commanded one is twice K_x along the track.
 
-    It settles x_e = -1/50 m behind, where the gain of the heading is K_theta + K_y x_e: on curves a trace of it is left.
+    It settles at x_e = -1/50 m, where the gain of the heading is K_theta + K_y x_e: on curves a trace of it is left.
     """
     faster, higher = margins(scenario("plant.speed_scale=2.0")), margins(scenario("controller.kx=50.0"))
     assert (faster.n_lifted, faster.n_bursts) == (higher.n_lifted, higher.n_bursts)
