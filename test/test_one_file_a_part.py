@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -188,3 +189,40 @@ def test_one_new_file_is_a_criterion(copied: Path, tmp_path: Path) -> None:
         python(copied, "-c", PLACES)
     finally:
         file.unlink()
+
+
+@pytest.mark.no_cover
+def test_a_law_that_was_edited_is_judged_as_it_is(copied: Path, tmp_path: Path) -> None:
+    """With twice the gain in its code, the law at K_x = 25 has the margins of K_x = 50; with its sign turned, none."""
+    file, out = copied / "agv_cloud/control/kanayama.py", tmp_path / "found.json"
+    as_it_was = file.read_text()
+    line = (
+        "config/paper.yaml",
+        "--set",
+        "error_detector.track=line",
+        "--set",
+        "plant.duration=20.0",
+        "--json",
+        str(out),
+    )
+
+    def found(*arguments: str) -> Any:
+        agv_ncs(copied, *arguments)
+        return json.loads(out.read_text())
+
+    assert "+ kx * x_e" in as_it_was
+    doubled = found("stability", *line, "--set", "controller.kx=50.0")["n_max"]
+    assert doubled["lifted"] == 5  # a = 0.25 < 2 sin(pi / (2 (2n + 1))), 0.2846 at n = 5
+    assert doubled["bursts"] == 6  # (n + 1) a < 2
+    try:
+        file.write_text(as_it_was.replace("+ kx * x_e", "+ 2.0 * kx * x_e"))
+        edited = found("stability", *line)["n_max"]
+        assert {name: edited[name] for name in ("lifted", "bursts")} == {
+            name: doubled[name] for name in ("lifted", "bursts")
+        }
+        assert edited["paper"] is None  # eq. 55 is of another law
+        file.write_text(as_it_was.replace("+ kx * x_e", "- kx * x_e"))
+        assert found("simulate", *line)["verdict"] not in ("asymptotic", "mean-square", "bounded")
+        assert found("stability", *line)["n_max"]["lifted"] in (-1, None)
+    finally:
+        file.write_text(as_it_was)

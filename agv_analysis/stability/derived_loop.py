@@ -27,6 +27,7 @@ from agv_analysis.stability.error_dynamics import (
     nominal_motion,
 )
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
+from agv_analysis.stability.linearisation import command_matrices, plant_matrices
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.staleness.estimate import staleness_policy
@@ -46,7 +47,7 @@ def linear_loop(scenario: Scenario, v_r: Floats, w_r: Floats) -> LinearLoop:
     A law that looks ahead is given the speeds of where it looks. Raises NoNominalMotionError where the loop does not
     settle even without losses: it has no motion about which an error could be small.
     """
-    if is_canonical(scenario, v_r):
+    if has_closed_form(scenario, v_r, w_r):
         return kanayama_loop(
             v_r, w_r, scenario.controller, scenario.plant.ts, predicts=scenario.error_detector.policy == "predict"
         )
@@ -63,20 +64,56 @@ def derived_loop(scenario: Scenario, v_r: Floats, w_r: Floats) -> LinearLoop:
     return _assembled(scenario, model, rows, found, v_r, w_r)
 
 
-def is_canonical(scenario: Scenario, v_r: Floats) -> bool:
+def has_closed_form(scenario: Scenario, v_r: Floats, w_r: Floats) -> bool:
     """Is the nominal motion zero error, with Kanayama's law on a unicycle by Euler's step that obeys at once?
 
-    Then the derivatives have a closed form.
+    Then the matrices have a closed form, here at the speeds v_r [m/s], w_r [rad/s], shape (N,) each. The functions that
+    the nodes call may have been edited: where they are fastest, slowest and turn most, their derivatives must agree.
     """
     plant, edge = scenario.plant, scenario.error_detector
-    return (
+    if not (
         scenario.controller.law == KANAYAMA
         and obeys_at_once(plant)
         and plant.integration == "euler"
         and scenario.controller.steps_ahead == 0
         and (edge.policy in ("hold", "align") or (edge.policy == "predict" and edge.integration == "euler"))
         and float(np.abs(v_r).max()) < scenario.controller.v_max
-    )
+    ):
+        return False
+    steps = np.unique([np.abs(v_r).argmax(), np.abs(v_r).argmin(), np.abs(w_r).argmax()])
+    return _agrees_with_closed_form(scenario, v_r[steps], w_r[steps])
+
+
+def _agrees_with_closed_form(scenario: Scenario, v: Floats, w: Floats) -> bool:
+    """Is zero error kept at the speeds v [m/s], w [rad/s], shape (N,), and are the derivatives those of the theory?"""
+    model = model_of(scenario)
+    rows = np.repeat(model.start(v, w)[None], len(v), axis=0)
+    found = model.derivatives(rows, v, w)
+    A, B = plant_matrices(v, w, scenario.plant.ts)
+    L_h = command_matrices(v, scenario.controller)
+    derived = [
+        (found.plant_of_state[:, :ERRORS, :ERRORS], A),
+        (found.plant_of_command[:, :ERRORS], B),
+        (found.command_of_error, L_h),
+        (found.following[:, :ERRORS], np.zeros((len(v), ERRORS))),
+        (found.plant_of_state[:, :ERRORS, ERRORS:], np.zeros((len(v), ERRORS, model.size - ERRORS))),
+    ]
+    policy = _policy_derivatives(scenario, model, rows, found.command, v, w)
+    if (policy is not None) != (scenario.error_detector.policy == "predict"):
+        return False
+    if policy is not None:
+        derived += [(policy[0], A), (policy[1], B)]
+    return all(np.allclose(one, other, rtol=1e-9, atol=1e-9) for one, other in derived)
+
+
+def is_kanayamas_law(scenario: Scenario) -> bool:
+    """Does the control law answer a small error as Kanayama's does, by its name and by its derivatives?"""
+    if scenario.controller.law != KANAYAMA:
+        return False
+    model, v = model_of(scenario), np.array([min(1.0, 0.5 * scenario.controller.v_max)])
+    found = model.derivatives(model.start(v, v)[None], v, v)
+    L_h = command_matrices(v, scenario.controller)
+    return bool(np.allclose(found.command_of_error, L_h, rtol=1e-9) and np.allclose(found.command, v[0], rtol=1e-9))
 
 
 def _assembled(

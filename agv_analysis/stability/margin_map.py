@@ -16,7 +16,7 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.criterion import MapColumn
-from agv_analysis.stability.derived_loop import is_canonical, linear_loop
+from agv_analysis.stability.derived_loop import has_closed_form, linear_loop
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.margin_map_points import Point
 from agv_analysis.stability.scenario_loop import lap_of
@@ -90,7 +90,9 @@ def margin_map(
     at_first = {name: value for name, (value, _) in axes_of(scenario).items()}
     places = [{**at_first, axes[0]: x, axes[1]: y} for x in first.tolist() for y in second.tolist()]
     labels = [f"{axis} [{unit}]" if unit else axis for axis, unit in zip(axes, units, strict=True)]
-    if _has_closed_form(scenario):
+    fastest = max(places, key=lambda place: abs(place[SPEED]))
+    v, w = np.array([fastest[SPEED]]), np.array([fastest[SPEED] * fastest[CURVATURE]])
+    if scenario.error_detector.policy != "predict" and has_closed_form(scenario, v, w):
         points = [Point(**place) for place in places]
         progress(len(points))
         found = {column.name: column.of_points(points) for column in map_columns()}
@@ -104,11 +106,6 @@ def margin_map(
     return MarginMap(
         axes, (labels[0], labels[1]), first, second, {name: n.reshape(shape) for name, n in found.items()}
     )  # fmt: skip
-
-
-def _has_closed_form(scenario: Scenario) -> bool:
-    """Do closed forms hold at every point: Kanayama's law at zero error, poses that are held?"""
-    return is_canonical(scenario, np.zeros(1)) and scenario.error_detector.policy != "predict"
 
 
 def _of_place(scenario: Scenario, place: dict[str, float]) -> list[int]:

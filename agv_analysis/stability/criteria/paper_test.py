@@ -20,7 +20,7 @@ from agv_analysis.stability.criteria.criterion import (
     finite,
     steps_text,
 )
-from agv_cloud.control.registry import KANAYAMA
+from agv_analysis.stability.derived_loop import is_kanayamas_law
 from agv_plant.vehicle.registry import UNICYCLE
 
 _OTHER_LOOP = "no answer: eq. 55 is of Kanayama's law on a unicycle"
@@ -43,7 +43,7 @@ class PaperTest:
 
 def applies_to(scenario: Scenario) -> bool:
     """Is it the law and the vehicle that eq. 55 was written for?"""
-    return scenario.controller.law == KANAYAMA and scenario.plant.vehicle == UNICYCLE
+    return scenario.plant.vehicle == UNICYCLE and is_kanayamas_law(scenario)
 
 
 def paper_test(run: Run) -> PaperTest:
