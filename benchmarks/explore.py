@@ -53,9 +53,9 @@ def scenario_and_answer(base: Scenario, values: Values, pinned: Scenario | None)
 
 WATCH = """
 const plots = [...document.querySelectorAll(".js-plotly-plot")];
-const told = document.getElementById("told");
+const summary = document.getElementById("summary");
 const written = () => new Promise(seen => new MutationObserver(seen).observe(
-  told, { childList: true, subtree: true, characterData: true }));
+  summary, { childList: true, subtree: true, characterData: true }));
 window.moved = new Promise(done => addEventListener("keydown", () => {
   const begun = performance.now();
   Promise.all([written(), ...plots.map(plot => new Promise(drawn => plot.once("plotly_afterplot", drawn)))])
@@ -97,7 +97,7 @@ def _moves(browser: str, driver: str, address: str, served: int) -> list[float]:
     chrome: Any = webdriver.Chrome(options=options, service=Service(driver))
     try:
         chrome.get(address)
-        shown = "return document.querySelectorAll('#told tr, #lap tr').length > 12"  # both tables, so all is compiled
+        shown = "return document.querySelectorAll('#summary tr, #lap tr').length > 12"  # both: all is compiled
         WebDriverWait(chrome, 120.0).until(lambda _: chrome.execute_script(shown))
         handle, found = chrome.find_element("css selector", "#kx [role=slider]"), []
         for is_beside in (*[False] * 10, *[True] * 10):

@@ -107,7 +107,7 @@ CRITERION = Criterion(
 
 PLACES = """
 import sys
-from agv_analysis.explore.background_criteria import lap_rows
+from agv_analysis.explore.background_criteria import criteria_rows
 from agv_analysis.explore.response import summary_rows
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
@@ -115,7 +115,7 @@ from agv_analysis.sweep.borders import border_places
 from agv_analysis.sweep.plan import parse_axis
 scenario = load_scenario("config/paper.yaml", ["plant.duration=2.0", "error_detector.track=line"])
 assert dict(summary_rows(simulate(scenario)))["Walker at once"] == "1.6 m/s"
-assert dict(lap_rows(scenario))["Walker's speed"] == "1.6 m/s"
+assert dict(criteria_rows(scenario))["Walker's speed"] == "1.6 m/s"
 assert 29.0 < border_places(scenario, parse_axis("controller.kx=10:50:9"))["walker"][0] < 31.0
 """
 

@@ -92,8 +92,8 @@ def command(
     if found.left_out:
         console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
-        told = {f"{name}_reason": reason for name, reason in reasons.items()}
-        gains = {"best_kx": {**best, **told}} if best else {"best_kx": None, **told}
+        notes = {f"{name}_reason": reason for name, reason in reasons.items()}
+        gains = {"best_kx": {**best, **notes}} if best else {"best_kx": None, **notes}
         write_json(json_file, {**found.to_json(), "empirical": twins.to_json(), **gains})
 
 

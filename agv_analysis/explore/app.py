@@ -7,7 +7,7 @@ import signal
 from collections.abc import Callable
 from typing import Any
 
-from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside
+from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, values_of
 from agv_analysis.explore.sliders import (
@@ -52,8 +52,8 @@ pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
 """
 
 
-Lap = Callable[[Scenario, Scenario | None], list[tuple[str, str, str]] | None]
-"""As `lap_beside`; None if the setting was moved on before its turn came."""
+CriteriaRows = Callable[[Scenario, Scenario | None], list[tuple[str, str, str]] | None]
+"""As `compared_criteria_rows`; None if the setting was moved on before its turn came."""
 
 _REST = 0.3
 """Seconds for which the page has to be left alone before the lap's criteria are computed."""
@@ -67,8 +67,8 @@ A browser compiles what it has run some times: so it has before a hand moves the
 _MOVED_ON = [("Not computed", "the page was moved on", "")]
 
 
-def build(base: Scenario, lap: Lap = lap_beside) -> Any:
-    """The page as a Dash app; `lap` may take its time. Raises UserError if Dash is not installed."""
+def build(base: Scenario, criteria: CriteriaRows = compared_criteria_rows) -> Any:
+    """The page as a Dash app; `criteria` may take its time. Raises UserError if Dash is not installed."""
     try:
         dash: Any = importlib.import_module("dash")
     except ImportError:
@@ -76,7 +76,7 @@ def build(base: Scenario, lap: Lap = lap_beside) -> Any:
     app = dash.Dash("agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets")
     app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
     app.layout = _layout(dash, values_of(base))
-    _connect(dash, app, base, lap)
+    _connect(dash, app, base, criteria)
     return app
 
 
@@ -106,7 +106,7 @@ def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
             ]
         ),
         html.Div("", id="problem", role="alert"),
-        html.Table([], id="told"),
+        html.Table([], id="summary"),
         html.H2("Over the whole lap"),
         html.Table([], id="lap"),
         dcc.Graph(id="plot-track", style={"height": "420px"}, config={"displaylogo": False}),
@@ -141,7 +141,7 @@ def _slider(dcc: Any, slider: Slider, value: float) -> Any:
     return dcc.Slider(slider.low, slider.high, slider.step, value=value, marks=ends, id=slider.key, updatemode="drag")
 
 
-def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
+def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows) -> None:
     Input, Output, State = dash.Input, dash.Output, dash.State
     inputs, states = [Input(key, "value") for key in KEYS], [State(key, "value") for key in KEYS]
 
@@ -149,7 +149,7 @@ def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
         return dict(zip(KEYS, given, strict=True))
 
     @app.callback(
-        Output("plot-track", "figure"), Output("plot-time", "figure"), Output("told", "children"),
+        Output("plot-track", "figure"), Output("plot-time", "figure"), Output("summary", "children"),
         Output("problem", "children"), Output("lap", "className"),
         *inputs, Input("pinned", "data"), Input("again", "n_intervals"),
     )  # fmt: skip
@@ -174,7 +174,7 @@ def _connect(dash: Any, app: Any, base: Scenario, lap: Lap) -> None:
         *settings, pinned = given
         try:
             scenario = scenario_of(base, values(tuple(settings)))
-            found = lap(scenario, None if pinned is None else scenario_of(base, pinned))
+            found = criteria(scenario, None if pinned is None else scenario_of(base, pinned))
         except UserError:  # `move` says why
             return [], ""
         return _table(dash.html, _MOVED_ON if found is None else found), ""
@@ -220,8 +220,8 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
 
     Raises UserError if the port is taken or Dash is not installed.
     """
-    lap = LatestOnlyWorker(lap_beside, rest=_REST)
-    app = build(base, lap)
+    criteria = LatestOnlyWorker(compared_criteria_rows, rest=_REST)
+    app = build(base, criteria)
     werkzeug: Any = importlib.import_module("werkzeug.serving")
     lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections
     quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
@@ -236,5 +236,5 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
     except KeyboardInterrupt:
         pass
     finally:
-        lap.close()
+        criteria.close()
         server.server_close()

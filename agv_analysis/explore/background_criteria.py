@@ -21,14 +21,14 @@ _NICE = 19
 """Background computations yield to the page and to the browser."""
 
 
-def lap_beside(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:
+def compared_criteria_rows(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:
     """Name, value and that of a pinned scenario, which meets the same outages; empty without one."""
-    others = {} if pinned is None else dict(lap_rows(with_channel_of(pinned, scenario)))
-    return [(name, value, others.get(name, "")) for name, value in lap_rows(scenario)]
+    others = {} if pinned is None else dict(criteria_rows(with_channel_of(pinned, scenario)))
+    return [(name, value, others.get(name, "")) for name, value in criteria_rows(scenario)]
 
 
 @functools.lru_cache(maxsize=64)
-def lap_rows(scenario: Scenario) -> list[tuple[str, str]]:
+def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
     """The verdict, what the losses of the simulated run do, and the margins of a scenario over its lap.
 
     What cannot be simulated has no rows: the page says why at once.

@@ -21,7 +21,7 @@ from agv_ros.parameters import SHARED
 _MOST_POINTS = 1200
 """Points of a line: the lowest and the highest of each pixel or two."""
 
-_MOST_DOTS = 100
+_MOST_MARKERS = 100
 """Each of them costs a drawing more than twenty points of a line."""
 
 
@@ -43,7 +43,7 @@ def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
     values = list(summary_rows(run))
     others = values_of_other or [""] * len(values)
     return Response(
-        track=figure([first], _MOST_POINTS, dots=_MOST_DOTS),
+        track=figure([first], _MOST_POINTS, markers=_MOST_MARKERS),
         time=figure(over_time, _MOST_POINTS),
         rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
     )

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agv_analysis.report.panels import BARS, DOTS, DRIVEN, LIMIT, LOST, OTHER, REFERENCE, STEP, Line, Panel, thinned
+from agv_analysis.report.panels import BARS, DRIVEN, LIMIT, LOST, MARKERS, OTHER, REFERENCE, STEP, Line, Panel, thinned
 from agv_ros.errors import UserError
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def _draw_line(axes: Axes, line: Line) -> None:
     colour = COLOURS[line.role]
     if line.style == BARS:
         axes.bar(line.x, line.y, color=colour, label=line.name)
-    elif line.style == DOTS:
+    elif line.style == MARKERS:
         axes.plot(line.x, line.y, ".", color=colour, ms=2.0, label=line.name, rasterized=len(line.x) > _MOST_POINTS)
     elif line.style == STEP:
         axes.step(line.x, line.y, where="post", color=colour, lw=0.6, label=line.name)

@@ -16,7 +16,7 @@ from agv_analysis.stability.analysis import Analysis, Observations
 
 TIME = "time [s]"
 
-LINE, STEP, DOTS, BARS = "line", "step", "dots", "bars"
+LINE, STEP, MARKERS, BARS = "line", "step", "markers", "bars"
 
 REFERENCE, DRIVEN, LOST, OTHER, LIMIT = "reference", "driven", "lost", "other", "limit"
 """What a line stands for, which gives it its colour."""
@@ -85,7 +85,7 @@ def track(run: Run) -> Panel:
     lines = (
         Line("reference", reference[:, 0], reference[:, 1], REFERENCE),
         Line("AGV", x, y, DRIVEN),
-        Line("pose lost", x[run.lost], y[run.lost], LOST, DOTS, why),
+        Line("pose lost", x[run.lost], y[run.lost], LOST, MARKERS, why),
     )
     return Panel("track", "Track", "x [m]", "y [m]", lines[: 3 if run.lost.any() else 2], equal=True)
 
@@ -177,8 +177,8 @@ def unit_circle(analysis: Analysis) -> Panel:
     eigenvalues, multipliers = paper_eigenvalues(analysis.run), lifted_multipliers(analysis)
     lines = (
         Line("|z| = 1", np.cos(angle), np.sin(angle), LIMIT),
-        Line("lifted system", multipliers.real, multipliers.imag, LOST, DOTS),
-        Line("paper's A(k)", eigenvalues.real, eigenvalues.imag, DRIVEN, DOTS),
+        Line("lifted system", multipliers.real, multipliers.imag, LOST, MARKERS),
+        Line("paper's A(k)", eigenvalues.real, eigenvalues.imag, DRIVEN, MARKERS),
     )
     title = f"Eigenvalues: the paper's along the run, the lifted system's for a pose always {analysis.n} steps old"
     return Panel("eigenvalues", title, "Re", "Im", lines, equal=True)

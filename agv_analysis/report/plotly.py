@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from agv_analysis.report.panels import (
     BARS,
-    DOTS,
     DRIVEN,
     LIMIT,
     LOST,
+    MARKERS,
     OTHER,
     REFERENCE,
     STEP,
@@ -32,7 +32,7 @@ COLOURS = {REFERENCE: "#8a8a8a", DRIVEN: "#3b8bd0", LOST: "#e0453c", OTHER: "#e3
 MOST_POINTS = 20_000
 """Points of one line in a report; longer runs are thinned."""
 
-MOST_DOTS = 5000
+MOST_MARKERS = 5000
 """Single points: each is an element of the page, and costs as much as many points of a line."""
 
 _LONGEST_CAUSE = 60
@@ -42,7 +42,7 @@ _GAP = 0.22
 """Share of a row that is left free above it, for its legend."""
 
 
-def figure(panels: Sequence[Panel], most: int = MOST_POINTS, dots: int = MOST_DOTS) -> dict[str, Any]:
+def figure(panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST_MARKERS) -> dict[str, Any]:
     """A figure of panels one below the other on one common x axis, which zooms all of them.
 
     Lines are drawn as vectors: without a graphics card WebGL takes seconds for what they take a tenth of one, and in
@@ -68,7 +68,7 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, dots: int = MOST_DO
         layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel)}
         layout[f"legend{number}"] = {"orientation": "h", "x": 0.0, "y": top, "yanchor": "bottom"}
         of_row = {"yaxis": f"y{number}", "legend": f"legend{number}"}
-        traces += [_trace(line, most, dots) | of_row for line in panel.lines]
+        traces += [_trace(line, most, markers) | of_row for line in panel.lines]
     return {"data": traces, "layout": layout}
 
 
@@ -83,14 +83,14 @@ def _y_axis(panel: Panel) -> dict[str, Any]:
     return axis
 
 
-def _trace(line: Line, most: int, dots: int) -> dict[str, Any]:
-    line = thinned(line, dots if line.style == DOTS else most)
+def _trace(line: Line, most: int, markers: int) -> dict[str, Any]:
+    line = thinned(line, markers if line.style == MARKERS else most)
     colour = COLOURS[line.role]
     trace: dict[str, Any] = {"name": line.name, "x": _packed(line.x), "y": _packed(line.y), "showlegend": True}
     if line.style == BARS:
         return {**trace, "type": "bar", "marker": {"color": colour}}
     trace["type"] = "scatter"
-    if line.style == DOTS:
+    if line.style == MARKERS:
         why = {} if line.slots is None else _why(line.slots)
         return {**trace, "mode": "markers", "marker": {"color": colour, "size": 4}, **why}
     dash = {"dash": "dash"} if line.role == LIMIT else {}

@@ -45,9 +45,9 @@ def _draw(axes: Any, table: Table) -> None:
 
     shown: list[float] = []
     for marker, column in zip(_MARKERS, table.drawn, strict=False):
-        dots = [(value, i) for i, row in enumerate(table.rows) if (value := _number(row[column])) is not None]
-        shown += [value for value, _ in dots]
-        axes.plot([x for x, _ in dots], [i for _, i in dots], marker, label=column, ms=4.0, alpha=0.8)
+        values = [(value, i) for i, row in enumerate(table.rows) if (value := _number(row[column])) is not None]
+        shown += [value for value, _ in values]
+        axes.plot([x for x, _ in values], [i for _, i in values], marker, label=column, ms=4.0, alpha=0.8)
     names = list(table.rows[0])[: table.named]
     axes.set_yticks(range(len(table.rows)), [", ".join(text_of(row[name]) for name in names) for row in table.rows])
     axes.set_ylabel(", ".join(names))

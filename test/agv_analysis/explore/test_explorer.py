@@ -20,7 +20,7 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside, lap_rows
+from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows, criteria_rows
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
 from agv_analysis.explore.sliders import gain_slider
@@ -136,15 +136,15 @@ def test_both_runs_are_drawn(base: Scenario) -> None:
 
 def test_a_pinned_setting_has_margins_of_its_own_under_the_same_outages(base: Scenario) -> None:
     slow = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0))
-    both = {name: (value, other) for name, value, other in lap_beside(base, slow)}
+    both = {name: (value, other) for name, value, other in compared_criteria_rows(base, slow)}
     assert both["Pose always n steps old"] == ("12 steps (60 ms)", "62 steps (310 ms)")
     assert both["Any outages up to n"] == ("14 steps (70 ms)", "78 steps (390 ms)")
-    alone = lap_rows(slow)
+    alone = criteria_rows(slow)
     assert {name: other for name, (_, other) in both.items()} == dict(alone)
 
 
 def test_the_losses_of_a_run_are_judged_as_the_analysis_does(base: Scenario) -> None:
-    found = dict(lap_rows(base))
+    found = dict(criteria_rows(base))
     analysis = analyse(simulate(base))
     assert found["Verdict"] == sentence(analysis)
     assert analysis.floquet is not None
@@ -236,12 +236,12 @@ def address(base: Scenario) -> Iterator[str]:
     import threading
 
     from agv_analysis.explore.app import HOST, build
-    from agv_analysis.explore.background_criteria import LatestOnlyWorker, lap_beside
+    from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows
 
     pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
     from werkzeug.serving import make_server
 
-    lap = LatestOnlyWorker(lap_beside)
+    lap = LatestOnlyWorker(compared_criteria_rows)
     server = make_server(HOST, 0, build(base, lap).server, threaded=True)
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -285,7 +285,7 @@ def page(chromium: Chrome, address: str) -> Page:
     chromium.get_log("browser")  # type: ignore[no-untyped-call]
     chromium.get(address)
     page = Page(chromium)
-    page.until(lambda: "Paper's test" in page.text("told"))
+    page.until(lambda: "Paper's test" in page.text("summary"))
     return page
 
 
@@ -297,14 +297,14 @@ def complaints(page: Page) -> list[str]:
 def test_moving_a_slider_simulates_anew(page: Page) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    assert "up to 14 along" in page.text("told")
+    assert "up to 14 along" in page.text("summary")
     handle = page.slider("kx")
     handle.send_keys(Keys.PAGE_UP)  # ten steps at once
-    page.until(lambda: "up to 14 along" not in page.text("told"))
+    page.until(lambda: "up to 14 along" not in page.text("summary"))
     kx = float(handle.get_attribute("aria-valuenow"))
     n = int(np.ceil(2.0 / (0.005 * kx)) - 2.0)  # T_s K_x L < 2 with L = n + 1
     assert kx > 25.0
-    page.until(lambda: f"up to {n} along" in page.text("told"))
+    page.until(lambda: f"up to {n} along" in page.text("summary"))
     assert page.text("problem") == ""
     assert complaints(page) == []
 
@@ -339,7 +339,7 @@ def test_a_law_brings_its_own_sliders(page: Page) -> None:
     assert page.text("problem") == ""
     choose(page, "law", "kanayama")
     page.until(lambda: shown() == ["gains-of-kanayama"])
-    page.until(lambda: "Paper's test" in page.text("told") and page.text("problem") == "")
+    page.until(lambda: "Paper's test" in page.text("summary") and page.text("problem") == "")
     assert complaints(page) == []
 
 
@@ -371,12 +371,12 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
 
 def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     page.click("preset-missed")
-    page.until(lambda: "13 steps (65 ms)" in page.text("told"))
+    page.until(lambda: "13 steps (65 ms)" in page.text("summary"))
     page.click("pin")
     page.until(lambda: "pinned" in page.names("track"))
     page.click("preset-predicted")
-    page.until(lambda: "predicted: with an exact model" in page.text("told"))
-    errors = page.text("told").splitlines()[0]
+    page.until(lambda: "predicted: with an exact model" in page.text("summary"))
+    errors = page.text("summary").splitlines()[0]
     now, pinned = errors.removeprefix("Error in the last tenth at most ").split(" m at most ")
     assert float(now) < 1e-6 < 1e3 < float(pinned.removesuffix(" m"))
     assert page.names("time").count("pinned") == 3
@@ -432,7 +432,7 @@ def test_it_is_dark_where_all_else_is(page: Page) -> None:
             wanted = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
             page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", wanted)
             papers[scheme] = colour("body", "backgroundColor")
-            inks = [colour("#told", "color"), colour("label", "color"), colour("#plot-time .xtick text", "fill")]
+            inks = [colour("#summary", "color"), colour("label", "color"), colour("#plot-time .xtick text", "fill")]
             assert min(contrast(ink, papers[scheme]) for ink in inks) > 4.5, inks
     finally:
         page.chrome.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

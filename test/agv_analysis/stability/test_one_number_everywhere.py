@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis.explore.background_criteria import lap_rows
+from agv_analysis.explore.background_criteria import criteria_rows
 from agv_analysis.explore.response import summary_rows
 from agv_analysis.report.eigenvalues import lifted_multipliers
 from agv_analysis.report.page import render
@@ -72,7 +72,7 @@ def test_the_largest_n(scenario: Scenario, analysis: Analysis) -> None:
     assert (n >= analysis.n) == analysis.lifted_stable
     shown = dict(found.rows())["Pose always n steps old"]
     assert shown.startswith(f"{n} steps" if found.n_lifted is not None else "no bound")
-    assert dict(lap_rows(scenario))["Pose always n steps old"] == shown
+    assert dict(criteria_rows(scenario))["Pose always n steps old"] == shown
     assert shown in render(analysis)
 
 
