@@ -1008,8 +1008,9 @@ def differentiable(function: Function) -> Function:
 
     In the copy's globals, closure and defaults, each plain function is replaced by such a copy as well, also behind the
     name of its module and in dicts, lists and tuples of functions, `functools.cache` and numba's decorators are
-    removed, and `math` and the builtins `float`, `int`, `min`, `max` are replaced by versions for dual numbers.
-    Classes, methods, compiled functions, and the functions of numpy, scipy and the standard library stay as they are.
+    removed, and `math`, the builtins `float`, `int`, `min`, `max` and `numpy.float64` are replaced by versions for dual
+    numbers. Other classes, methods, compiled functions, and the functions of numpy, scipy and the standard library stay
+    as they are.
 
     The copy is kept as long as the function exists, with the globals that it had when it was copied.
     """
@@ -1024,6 +1025,8 @@ def _substitute(value: Any) -> Any:
     """What a copied function uses in place of a value."""
     if value is math:
         return _DUAL_MATH
+    if value is np:
+        return _DUAL_NUMPY
     if isinstance(value, types.ModuleType):
         return value if _is_left_alone(value.__name__) else _ModuleView(value)
     if isinstance(value, (types.BuiltinFunctionType, type)):
@@ -1102,6 +1105,17 @@ class _ModuleView:
         return _substitute(getattr(self._module, name))
 
 
+class _NumpyView:
+    """numpy, whose functions know dual numbers and whose types do not."""
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(np, name)
+        return _BUILTINS.get(value, value) if isinstance(value, type) else value
+
+
+_DUAL_NUMPY = _NumpyView()
+
+
 def _import(*arguments: Any, **options: Any) -> Any:
     """The import statement inside a function."""
     return _substitute(builtins.__import__(*arguments, **options))
@@ -1110,6 +1124,7 @@ def _import(*arguments: Any, **options: Any) -> Any:
 _BUILTINS: dict[Any, Any] = {
     **{getattr(math, name): version for name, version in _MATH.items()},
     float: _Float,
+    np.float64: _Float,
     int: _Int,
     min: _min,
     max: _max,

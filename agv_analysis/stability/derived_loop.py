@@ -23,6 +23,7 @@ from agv_analysis.stability.error_dynamics import (
     ERRORS,
     LoopModel,
     StepDerivatives,
+    derivatives_of_part,
     model_of,
     nominal_motion,
 )
@@ -193,7 +194,8 @@ def _policy_derivatives(
     error = [np.ascontiguousarray(column) for column in rows[:, :ERRORS].T]
     later = [np.roll(column, -1) for column in error]
     zero = np.zeros(len(rows))
-    moved = jacobian(
+    moved = derivatives_of_part(
+        f"staleness policy {scenario.error_detector.policy}",
         replaced(policy_step, model.parts),
         [zero, zero, zero, command[:, 0], command[:, 1], *error, v_r, w_r, np.roll(v_r, -1), np.roll(w_r, -1),
          s.policy, s.ts, s.model_arc, s.policy_parameters],

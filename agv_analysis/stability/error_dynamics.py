@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import Numbers, Settings, period
 from agv_analysis.simulation.parts import memory_functions, replacements_of
 from agv_analysis.simulation.single import settings_of
-from agv_analysis.stability.derivatives import jacobian
+from agv_analysis.stability.derivatives import Jacobian, jacobian
 from agv_analysis.stability.products import ordered_product
 from agv_cloud.control.command import command
 from agv_cloud.control.registry import CONTROL_LAWS
@@ -35,6 +36,7 @@ from agv_plant.vehicle.motion import Motion
 from agv_plant.vehicle.registry import VEHICLES
 from agv_plant.vehicle.unicycle import euler_step
 from agv_ros.errors import UserError
+from agv_ros.parts import PartError
 from agv_ros.substitution import Function, Replacements, replaced
 
 ERRORS, DRIVE = 3, 3
@@ -137,13 +139,26 @@ class StepDerivatives:
     """Where a step has no derivative: the place in the code, with the first step of the lap concerned."""
 
 
+def derivatives_of_part(
+    part: str, function: Function, arguments: Sequence[object], with_respect_to: Sequence[int]
+) -> Jacobian:
+    """As `jacobian`, of a function that calls a part. Raises PartError with the part's name where that has none."""
+    try:
+        return jacobian(function, arguments, with_respect_to)
+    except UserError:
+        raise
+    except Exception as error:
+        raise PartError(f"{part} cannot be differentiated: {' '.join(str(error).split())}") from error
+
+
 class LoopModel:
     """The functions of a scenario's loop in error coordinates."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.settings = settings_of(scenario)
         self.parts: Replacements = replacements_of(scenario)
-        law, vehicle = CONTROL_LAWS.find(scenario.controller.law), VEHICLES.find(scenario.plant.vehicle)
+        self.law, self.vehicle = scenario.controller.law, scenario.plant.vehicle
+        law, vehicle = CONTROL_LAWS.find(self.law), VEHICLES.find(self.vehicle)
         self.states, self.memory = len(vehicle.states), law.memory
         stores: dict[Function, Function] = {}
         for placeholder, size in ((store_states, self.states), (store_law_memory, len(self.memory))):
@@ -157,6 +172,13 @@ class LoopModel:
     def size(self) -> int:
         """Numbers of the state."""
         return ERRORS + DRIVE + self.states + len(self.memory)
+
+    @property
+    def weights(self) -> Floats:
+        """What makes the numbers of two states comparable, shape (size,)."""
+        weights = np.ones(self.size)
+        weights[ERRORS + 2] = self.settings.ts  # an acceleration is a difference over T_s, and so is its rounding
+        return weights
 
     def state_of(self, row: Floats) -> ErrorState:
         """The state from its numbers, shape (size,)."""
@@ -187,12 +209,14 @@ class LoopModel:
         columns = list(np.ascontiguousarray(rows.T))
         memory, states = tuple(columns[memory_from:]), tuple(columns[fixed:memory_from])
         s, m, now = self.settings, len(memory), columns[:ERRORS]
-        law = jacobian(
+        law = derivatives_of_part(
+            f"control law {self.law}",
             self._command,
             [*now, v_r, w_r, memory, s.gains, s.ts, s.look_ahead, s.v_max],
             [0, 1, 2, *range(5, 5 + m)],
         )
-        plant = jacobian(
+        plant = derivatives_of_part(
+            f"vehicle {self.vehicle}",
             self._plant,
             [*columns[:fixed], states, law.value[:, 0], law.value[:, 1], v_r, w_r, s],
             list(range(memory_from + 2)),
@@ -239,33 +263,40 @@ def nominal_motion(model: LoopModel, v_r: Floats, w_r: Floats) -> Floats:
     if found is not None and np.array_equal(found[0], start):
         return found
     laps = max(_SETTLING_LAPS, math.ceil(_SETTLING_STEPS / len(v_r)))
-    settled = model.drive(start, np.tile(v_r, laps), np.tile(w_r, laps))[-1]
-    if found is None and np.isfinite(settled).all():  # from where the loop goes by itself
-        found = _newton(model, settled, v_r, w_r)
-    if found is None or not _is_reached(model, found, start, settled, laps, v_r, w_r):
+    driven = model.drive(start, np.tile(v_r, 2 * laps), np.tile(w_r, 2 * laps))
+    if found is None and np.isfinite(driven).all():  # from where the loop goes by itself
+        found = _newton(model, driven[laps * len(v_r)], v_r, w_r)
+    if found is None or not _is_reached(model, found, driven, v_r, w_r):
         raise NoNominalMotionError(_what_it_does_instead(model, v_r, w_r))
     return found
 
 
-def _is_reached(
-    model: LoopModel, found: Floats, start: Floats, settled: Floats, laps: int, v_r: Floats, w_r: Floats
-) -> bool:
+def _is_reached(model: LoopModel, found: Floats, driven: Floats, v_r: Floats, w_r: Floats) -> bool:
     """Does the loop, begun at zero error, come nearer to a lap that repeats itself, or is this unstable anyway?
 
-    Newton's method may also find a stable lap to which the loop never comes: far behind the reference, say, where a
-    limit holds all the time.
+    `driven` are the states of an even number of laps. Newton's method may also find a stable lap to which the loop
+    never comes: far behind the reference, say, where a limit holds all the time. A loop comes nearer if it is nearer in
+    the second half than in the first, or if it moves there as the derivatives say, however slowly that dies out.
     """
     lap = _lap_matrix(model.closed_loop(model.derivatives(found, v_r, w_r)))
     if not np.isfinite(lap).all() or np.abs(np.linalg.eigvals(lap)).max() >= 1.0 + 1e-6:
         return True
-    before, after = (float(np.abs(row[:ERRORS] - found[0, :ERRORS]).max()) for row in (start, settled))
-    return after <= max(0.99 * before, 1e-6)
+    if not np.isfinite(driven).all():
+        return False
+    laps, weights = (len(driven) - 1) // len(found), model.weights
+    away = np.abs(weights * (driven[:-1] - np.tile(found, (laps, 1)))).max(axis=1)
+    quarter = len(away) // 4
+    before, after = float(away[quarter : 2 * quarter].max()), float(away[3 * quarter :].max())
+    if after <= max(0.99 * before, 1e-6):
+        return True
+    halfway, end = (weights * (driven[k] - found[0]) for k in ((laps // 2) * len(found), -1))
+    predicted = weights * (np.linalg.matrix_power(lap, laps // 2) @ (halfway / weights))
+    return float(np.abs(end - predicted).max()) <= 0.05 * float(np.abs(halfway).max())
 
 
 def _newton(model: LoopModel, row: Floats, v_r: Floats, w_r: Floats) -> Floats | None:
     """Newton's method on the map of a lap, from the state `row`; None where it does not arrive."""
-    weights = np.ones(model.size)
-    weights[ERRORS + 2] = model.settings.ts  # an acceleration is a difference over T_s, and so is its rounding
+    weights = model.weights
     for _ in range(_ITERATIONS):
         rows = model.drive(row, v_r, w_r)
         missing = rows[-1] - row
@@ -303,7 +334,7 @@ def _what_it_does_instead(model: LoopModel, v_r: Floats, w_r: Floats) -> str:
     half = len(errors) // 2
     distance = np.hypot(errors[:, 0], errors[:, 1])
     drift = float(distance[-1] - distance[half]) / ((len(errors) - half) * ts)
-    if abs(drift) * (len(errors) - half) * ts > 0.5 * float(distance[half:].max()):
+    if drift * (len(errors) - half) * ts > 0.5 * float(distance[half:].max()):
         return f"without any loss the AGV falls behind its reference by {drift:.3g} m/s for ever"
     spread = np.ptp(errors[half:], axis=0)
     return (

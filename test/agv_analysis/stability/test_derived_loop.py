@@ -13,10 +13,12 @@ from scipy.optimize import fsolve
 
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario, load_scenario
+from agv_analysis.simulation import simulate
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability.derived_loop import derived_loop, linear_loop
-from agv_analysis.stability.error_dynamics import NoNominalMotionError
+from agv_analysis.stability.error_dynamics import NoNominalMotionError, derivatives_of_part
 from agv_analysis.stability.linear_loop import LinearLoop
+from agv_ros.parts import PartError
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
 TS = 0.005
@@ -236,3 +238,26 @@ def test_the_parked_and_the_unreachable_are_left_out() -> None:
     assert parked.size == 5  # any speed at all reaches all of the error
     warehouse = loop_of("error_detector.track=warehouse", "plant.lag=0.2")
     assert (warehouse.size, warehouse.outputs) == (5, 3)
+
+
+@pytest.mark.parametrize("ky", [0.1, 0.01])
+def test_a_slow_loop_that_begins_elsewhere_than_it_settles_has_its_nominal_motion(ky: float) -> None:
+    """The bicycle's steering starts straight, on a circle: the error grows at first, and takes minutes to die out."""
+    scenario = scenario_of(
+        "error_detector.track=circle", "plant.vehicle=bicycle", "plant.bicycle.steering_lag=0.1",
+        f"controller.ky={ky}", "plant.duration=400.0", "plant.initial_pose=[0.0, 0.0, 1.5707963267948966]",
+    )  # fmt: skip
+    found = derived_loop(scenario, *speeds(scenario, 20_000))
+    assert found.nominal is not None
+    np.testing.assert_allclose(found.nominal[:, :3], 0.0, rtol=0.0, atol=1e-9)
+    run = simulate(scenario)
+    distance = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
+    assert distance[-1] < 0.5 * distance[:4000].max()
+
+
+def test_a_law_that_cannot_be_differentiated_is_refused_by_name() -> None:
+    def through_text(x_e: float, y_e: float, theta_e: float, v_r: float, w_r: float) -> tuple[float, float]:
+        return float(str(v_r + x_e)), w_r + y_e + 2.0 * theta_e
+
+    with pytest.raises(PartError, match="control law through_text cannot be differentiated"):
+        derivatives_of_part("control law through_text", through_text, [np.zeros(1)] * 5, [0, 1, 2])

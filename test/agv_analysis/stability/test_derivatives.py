@@ -220,7 +220,7 @@ def test_a_tie_is_reported_with_its_rows_function_and_source_line() -> None:
     (kink,) = jacobian(rectified, (np.array([1.0, 0.0, -1.0, 0.0]),), [0]).not_differentiable
 
     assert kink.rows.tolist() == [1, 3]
-    assert re.fullmatch(r"rectified \(test_stability_derivatives\.py:\d+\): if x > 0\.0:", kink.where)
+    assert re.fullmatch(r"rectified \(test_derivatives\.py:\d+\): if x > 0\.0:", kink.where)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +249,7 @@ def test_kinks_and_jumps_are_reported(function: Callable[[float], float]) -> Non
     kinks = jacobian(function, (np.array([0.25, 0.0, -0.3]),), [0]).not_differentiable
 
     assert [kink.rows.tolist() for kink in kinks] == [[1]]
-    assert "test_stability_derivatives.py" in kinks[0].where
+    assert "test_derivatives.py" in kinks[0].where
 
 
 @pytest.mark.parametrize(
@@ -627,3 +627,12 @@ def test_jacobian_of_the_closed_loop_is_the_product_of_the_jacobians(
     np.testing.assert_allclose(
         jacobian(loop, (x, y, theta), range(3)).derivative[0], expected, rtol=1e-11, atol=1e-12
     )  # fmt: skip
+
+
+def test_numpy_s_float_is_a_number_like_the_builtin() -> None:
+    def square(x: float) -> Any:
+        return np.float64(x * x)
+
+    found = jacobian(square, [np.array([2.0, -3.0])], [0])
+    assert found.value[:, 0].tolist() == [4.0, 9.0]
+    assert found.derivative[:, 0, 0].tolist() == [4.0, -6.0]
