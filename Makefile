@@ -10,7 +10,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test bench docs sample clean
+.PHONY: demo test coverage bench docs sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -21,7 +21,10 @@ test: $(VENV)/test.stamp ## style, types and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n auto --dist worksteal --cov --cov-report=term $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n auto --dist worksteal $(PYTEST_ARGS)
+
+coverage: PYTEST_ARGS += --cov --cov-report=term ## the same with coverage, which takes longer
+coverage: test
 
 bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
 	$(BIN)/python -m benchmarks $(BENCH)
