@@ -59,8 +59,11 @@ def command(
     from rich.markup import escape
     from rich.table import Table
 
+    from agv_analysis.report.table import colour_of
     from agv_analysis.scenario import load_scenario
+    from agv_analysis.stability.evidence import evidence_of_scenario
     from agv_analysis.stability.margins import margins
+    from agv_analysis.stability.verdict import decide
 
     scenario = load_scenario(params, settings)
     if axes is not None:
@@ -70,10 +73,13 @@ def command(
     with Console(stderr=True).status("computing the margins ..."):
         found = margins(scenario)
         twins, seeds = _twins(scenario)
+        verdict = decide(evidence_of_scenario(scenario, twins))
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
     policy = scenario.error_detector.policy
+    table.add_row("Verdict", f"[bold {colour_of(verdict)}]{verdict.word}[/] (by {verdict.criterion})")
+    table.add_row("Because", escape(verdict.reason))
     table.add_row("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
     for name, value in (*found.rows(), ("Twins of this scenario, simulated", _told(twins, seeds))):
         table.add_row(name, escape(value))
@@ -95,17 +101,15 @@ def command(
     if json_file is not None:
         notes = {f"{name}_reason": reason for name, reason in reasons.items()}
         gains = {"best_kx": {**best, **notes}} if best else {"best_kx": None, **notes}
-        write_json(json_file, {**found.to_json(), "empirical": twins.to_json(), **gains})
+        said = {"verdict": verdict.word, "verdict_criterion": verdict.criterion, "verdict_reason": verdict.reason}
+        write_json(json_file, {**said, **found.to_json(), "empirical": twins.to_json(), **gains})
 
 
 def _twins(scenario: Scenario) -> tuple[Twins, range]:
     """Twins of one lap of the scenario, or of all of it where it has an end, under several seeds."""
-    from agv_analysis.stability.empirical import simulated_twins
-    from agv_cloud.reference.reference import lap_steps
+    from agv_analysis.stability.empirical import simulated_twins, with_an_end
 
-    if not math.isfinite(scenario.plant.duration):
-        lap = lap_steps(scenario.error_detector) * scenario.plant.ts
-        scenario = dataclasses.replace(scenario, plant=dataclasses.replace(scenario.plant, duration=lap))
+    scenario = with_an_end(scenario)
     seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
     return simulated_twins(scenario, seeds), seeds
 

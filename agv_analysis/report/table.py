@@ -9,7 +9,14 @@ from agv_analysis.metrics.outages import loss_causes
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.margins import margins
-from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, MEAN_SQUARE, UNKNOWN
+from agv_analysis.stability.verdict import BOUNDED, GREEN, UNDECIDED, UNKNOWN, Verdict
+
+_YELLOW = (BOUNDED, UNDECIDED, UNKNOWN)
+
+
+def colour_of(verdict: Verdict) -> str:
+    """Colour of a verdict's word, in rich's markup."""
+    return "green" if verdict.word in GREEN else "yellow" if verdict.word in _YELLOW else "red"
 
 
 def print_table(analysis: Observations) -> None:
@@ -92,10 +99,11 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
     for found in analysis.judgements.values():
         if found.why:
             yield found.label, _judged(found.stable, escape(found.why))
-    colour = {ASYMPTOTIC: "green", MEAN_SQUARE: "green", BOUNDED: "yellow", UNKNOWN: "yellow"}
     verdict = analysis.verdict
-    yield "Verdict", f"[bold {colour.get(verdict.word, 'red')}]{verdict.word}[/] (by {verdict.criterion})"
-    yield "Margin", verdict.margin
+    yield "Verdict", f"[bold {colour_of(verdict)}]{verdict.word}[/] (by {verdict.criterion})"
+    yield "Margin", escape(verdict.margin)
+    if verdict.word in GREEN:
+        yield "Because", escape(verdict.reason)
     for note in analysis.nominal_notes:
         yield "Loss-free motion", escape(note)
 

@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
-from agv_analysis.stability.verdict import ASYMPTOTIC, BOUNDED, INFEASIBLE, MEAN_SQUARE, UNKNOWN
+from agv_analysis.stability.verdict import (
+    ASYMPTOTIC,
+    BOUNDED,
+    INFEASIBLE,
+    MEAN_SQUARE,
+    UNDECIDED,
+    UNKNOWN,
+    against_stability,
+)
 
 
 def sentence(analysis: Observations) -> str:
@@ -12,29 +20,38 @@ def sentence(analysis: Observations) -> str:
         return "This recording proves nothing: messages are missing that no channel lost."
     if not isinstance(analysis, Analysis):
         return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
-    word, met = analysis.verdict.word, _met(analysis)
-    if word == MEAN_SQUARE and analysis.run.downlink_lost.any():
+    verdict, met = analysis.verdict, _met(analysis)
+    if verdict.word == MEAN_SQUARE and analysis.run.downlink_lost.any():
         return (
             "The AGV keeps to its track on radio links like these, which lose commands as well, but not in every case."
         )
-    if word == ASYMPTOTIC and analysis.n == 0:
+    if verdict.word == ASYMPTOTIC and analysis.n == 0:
         return "The AGV keeps to its track; no update was lost."
-    if word == ASYMPTOTIC and _is_late(analysis):
+    if verdict.word == ASYMPTOTIC and _is_late(analysis):
         return f"The AGV keeps to its track with {met}."
-    if word == ASYMPTOTIC:
+    if verdict.word == ASYMPTOTIC:
         return f"The AGV keeps to its track under {met}, or shorter ones, in any order."
-    if word == MEAN_SQUARE:
-        return (
-            f"The AGV keeps to its track on a radio link like this one, but not in every case: {met}, again and again, "
-            "would throw it off."
-        )
-    if word == UNKNOWN:
-        return f"Whether the loop is stable cannot be said: {analysis.verdict.margin.removeprefix('unknown: ')}."
-    if word == INFEASIBLE:
+    if verdict.word == MEAN_SQUARE:
+        return _in_mean_square(analysis, met)
+    if verdict.word in (UNKNOWN, UNDECIDED):
+        return f"Whether the loop is stable cannot be said: {verdict.reason}."
+    if verdict.word == INFEASIBLE:
         return f"The AGV does not keep to its track even on a perfect link: {analysis.infeasible}."
-    if word == BOUNDED:
+    if against_stability(analysis.evidence):
+        return f"The AGV does not keep to its track: {verdict.reason}."
+    if verdict.word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
     return f"The AGV does not keep to its track: {met} are too much for these gains."
+
+
+def _in_mean_square(analysis: Analysis, met: str) -> str:
+    n_bursts = analysis.evidence.n_bursts
+    if n_bursts is None or analysis.n <= n_bursts:
+        return f"The AGV keeps to its track on a radio link like this one; the worst that it met were {met}."
+    return (
+        f"The AGV keeps to its track on a radio link like this one, but not in every case: {met}, again and again, "
+        "would throw it off."
+    )
 
 
 def _is_late(analysis: Observations) -> bool:

@@ -12,14 +12,11 @@ from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.metrics.convergence import Convergence, convergence
 from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Run
-from agv_analysis.stability import joint_spectral_radius, mean_square
-from agv_analysis.stability.criteria import CRITERIA
-from agv_analysis.stability.criteria.any_outages import longest_for
-from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
+from agv_analysis.stability.criteria.criterion import Judgement, RunFacts
 from agv_analysis.stability.criteria.paper_test import PaperTest
+from agv_analysis.stability.evidence import evidence_of_run, judgements_of
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
-from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.verdict import Verdict, judge, judge_both_links, judge_infeasible, judge_late
+from agv_analysis.stability.verdict import Evidence, Verdict, decide
 from agv_ros.errors import UserError
 
 GAINS_UNKNOWN = "the controller's gains are not known: name its params file with --config"
@@ -27,8 +24,8 @@ GAINS_UNKNOWN = "the controller's gains are not known: name its params file with
 _OF_GAINS = (
     "paper_stable", "paper_radius", "lifted_stable", "lifted_radius", "bursts_stable", "bursts_verdict",
     "bursts_radius_lower", "bursts_radius_upper", "mean_square_stable", "mean_square_growth",
-    "floquet_multiplier_per_step", "contraction_per_step", "verdict", "verdict_criterion", "margin", "feasible",
-    "infeasible_reason", "nominal_notes",
+    "floquet_multiplier_per_step", "contraction_per_step", "verdict", "verdict_criterion", "verdict_reason",
+    "margin", "feasible", "infeasible_reason", "nominal_notes",
 )  # fmt: skip
 """Figures that nobody knows without the gains."""
 
@@ -94,6 +91,8 @@ class Analysis(Observations):
     judgements: Mapping[str, Judgement]
     """What each criterion says, by its key; those that do not apply are absent."""
     verdict: Verdict
+    evidence: Evidence
+    """What the verdict rests on."""
     infeasible: str = ""
     """Why the loop does not settle even without losses; empty if it does."""
     nominal_notes: tuple[str, ...] = ()
@@ -192,6 +191,7 @@ class Analysis(Observations):
             **values,
             "verdict": self.verdict.word,
             "verdict_criterion": self.verdict.criterion,
+            "verdict_reason": self.verdict.reason,
             "margin": self.verdict.margin,
             "feasible": not self.infeasible,
             "infeasible_reason": self.infeasible or None,
@@ -214,47 +214,19 @@ def analyse(run: Run) -> Analysis:
     if not run.gains_known:
         raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
     facts = RunFacts(run)
-    judged = {criterion.key: criterion.judge(facts) for criterion in CRITERIA}
-    judgements = {key: found for key, found in judged.items() if found is not None}
+    judgements = judgements_of(facts)
+    evidence = evidence_of_run(facts, judgements)
     return Analysis(
         run=run,
         outages=facts.outages,
         convergence=convergence(run),
         fit=facts.fit,
         judgements=judgements,
-        verdict=_verdict(facts, judgements),
+        verdict=decide(evidence),
+        evidence=evidence,
         infeasible=facts.infeasible,
         nominal_notes=(*facts.loop.active_limits, *facts.loop.not_differentiable) if facts.is_feasible else (),
     )
-
-
-def _verdict(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Verdict:
-    """One word from what the criteria say."""
-    run, v_max = facts.run, facts.run.scenario.controller.v_max
-    if not facts.is_feasible:
-        return judge_infeasible(facts.infeasible)
-    growth, both = judgements["mean_square"].detail
-    if facts.is_late:
-        return judge_late(_constant_delay(run), judgements["lifted"].detail, v_max)
-    if run.downlink_lost.any():
-        return judge_both_links(both, run.scenario.plant.downlink_policy, v_max)
-    n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
-    return judge(facts.n, n_bursts, growth, _burst_left(facts.fit, growth, facts.loop), v_max)
-
-
-def _constant_delay(run: Run) -> int | None:
-    """Age of the pose in slots, if it is always the same, but for the beginning, and commands are there at once."""
-    n = int(run.n_ul.max())
-    is_direct = not (run.downlink_lost.any() or has_late(run.downlink))
-    return n if is_direct and np.array_equal(run.n_ul, np.minimum(run.k, n)) else None
-
-
-def _burst_left(fit: ChannelFit, growth: float, loop: LinearLoop) -> float | None:
-    """By what factor the mean burst may grow at the fitted loss rate; None for a fit without bursts."""
-    if fit.model != "gilbert_elliott" or growth >= 0.0 or fit.chain.loss_rate >= 1.0:
-        return None
-    critical = mean_square.critical_burst(loop, fit.chain.loss_rate)
-    return critical / fit.mean_burst if np.isfinite(critical) else None
 
 
 def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:

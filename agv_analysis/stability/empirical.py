@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy as np
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate_batch
+from agv_cloud.reference.reference import lap_steps
 from agv_ros.errors import UserError
 
 
@@ -41,6 +42,14 @@ class Twins:
         """The figures by name; JSON has no infinity."""
         median = self.median if math.isfinite(self.median) else None
         return {"runs": len(self.contraction), "contracting": self.contracting, "median_contraction": median}
+
+
+def with_an_end(scenario: Scenario) -> Scenario:
+    """The scenario, ended after one lap of its track if it has no end."""
+    if math.isfinite(scenario.plant.duration):
+        return scenario
+    duration = lap_steps(scenario.error_detector) * scenario.plant.ts
+    return replace(scenario, plant=replace(scenario.plant, duration=duration))
 
 
 def simulated_twins(scenario: Scenario, seeds: Sequence[int]) -> Twins:

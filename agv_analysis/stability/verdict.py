@@ -1,98 +1,213 @@
-"""One word on a recorded loop: asymptotic, mean-square, bounded or unstable; what decided it, and what is left.
+"""One word on a loop from all that is known of it: the one function that all commands and pages ask.
 
-The criteria are asked from the strongest statement to the weakest:
+The words, from the strongest statement to the weakest:
 
-- `asymptotic`: whatever outages no longer than the longest of the run come, the error dies out (bursts);
-- `mean-square`: under the channel fitted to the run, E[e^2] dies out, though some sequence of outages would not be
-  survived;
-- `bounded`: neither, but the speed is limited, which makes a bounded limit cycle of what would otherwise grow;
-- `unstable`: neither, and nothing bounds the error.
+- `asymptotic`: whatever outages no longer than the longest of the run come, the error dies out;
+- `mean-square`: under the channel that was seen E[e^2] dies out, though some sequence of outages would not be survived;
+- `bounded`: neither, but under the limit on the speed the error stays bounded, as ten minutes of simulation show;
+- `undecided`: too little was seen of the link to say whether the loop is stable on it;
+- `unknown`: no criterion covers what was recorded, or the recording contradicts what is known of the loop;
+- `unstable`: the error grows;
+- `infeasible`: the loop does not settle even without losses.
 
-Where commands were lost as well, no sequence of outages is proved to be survived: E[e^2] under both fitted channels
-decides. Outages end with a fresh pose; where messages are late none is. A constant delay is judged by the lifted
-system, any other is `unknown`.
+The first two are green, and are said only where all evidence agrees: the loop settles without losses; the recorded
+commands are those of the control law; a stable loop is at least 95 % probable given the losses that were seen; the
+nonlinear loop under these losses forgets where it began and does not drift; the recorded deviations are those of the
+simulation. Evidence to the contrary wins over the criteria and is the reason given.
 
-The Floquet multiplier of the run's own sequence of losses stands beside the verdict and does not enter it: it says what
-those losses did to a small error in that one run. Where the mean square grows, most runs may still contract; and a run
-that is short, or ends inside an outage, may have a multiplier above 1 in a loop that contracts under any such outages.
+Outages end with a fresh pose; where messages are late none is. A constant delay is judged by the lifted system, other
+ages by the growth under them. The Floquet multiplier of the run's own losses stands beside the word and does not enter
+it: a run that is short, or ends inside an outage, may have a multiplier above 1 in a loop that contracts.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+from agv_analysis.stability.repeated_run import RepeatedRun
+
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
+UNDECIDED = "undecided"
+"""For a link of which too little was seen."""
 UNKNOWN = "unknown"
-"""For a run that no criterion here covers."""
+"""For a run that no criterion covers, or that contradicts what is known of its loop."""
 INFEASIBLE = "infeasible"
 """For a loop that does not settle even without losses."""
+
+GREEN = (ASYMPTOTIC, MEAN_SQUARE)
+"""Words that say that a loop is stable."""
+
+SURE = 0.95
+"""A green word needs at least this probability of a stable loop, `unstable` at most 1 less this."""
+
+_SURE_OF_RUNS = 0.9
+"""Share of simulated runs, at least, that must contract; a few end inside an outage."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The word, the criterion behind it, and the margin in words."""
+    """The word, the evidence that decided it, the margin in words, and the reason in a sentence."""
 
     word: str
     criterion: str
     margin: str
+    reason: str = ""
 
 
-def judge(n: int, n_bursts: int | None, mean_square_growth: float, burst_left: float | None, v_max: float) -> Verdict:
-    """Verdict on a run.
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a loop under its losses; the defaults say nothing against a green word."""
 
-    n: the longest outage seen [slots]; n_bursts: the longest that is proved to be survived in any order (None: all);
-    mean_square_growth: growth (logarithm, per step) of E[e^2] under the fitted channel; burst_left: by what factor its
-    mean burst may grow before that is positive (None: unknown or without bound); v_max: limit on the speed [m/s].
-    """
-    if n_bursts is None or n <= n_bursts:
-        left = "any number of" if n_bursts is None else str(n_bursts - n)
-        return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{'s' if left != '1' else ''}")
-    beyond = f"the longest outage exceeds what any sequence of outages may have by {n - n_bursts}"
-    if mean_square_growth < 0.0:
-        left = "" if burst_left is None else f"; outages may become {burst_left:.3g} times as long on average"
-        return Verdict(MEAN_SQUARE, "mean_square", beyond + left)
-    if v_max < float("inf"):
-        return Verdict(BOUNDED, "v_max", f"none: {beyond}; only the limit on the speed bounds the error")
-    return Verdict(UNSTABLE, "mean_square", f"none: {beyond}, and under the fitted channel the mean square grows")
+    n: int = 0
+    """The longest outage, or the oldest pose [slots]."""
+    n_bursts: int | None = None
+    """The longest outages that are proved to be survived in any order [slots]; None: all."""
+    is_unlimited: bool = False
+    """Have outages no longest one, so that no proof for outages up to `n` covers the link?"""
+    growth: float | None = None
+    """Growth (logarithm, per step) of E[e^2] under the links; None if no criterion covers them."""
+    growth_of: str = "mean_square"
+    """The criterion that `growth` comes from: mean_square, both_links, or one for late messages."""
+    burst_left: float | None = None
+    """By what factor outages may become longer on average before `growth` is positive; None: unknown or no bound."""
+    not_covered: str = ""
+    """Why `growth` is None."""
+    late_by: int | None = None
+    """The constant age of each pose [slots], if all were late by the same; then `lifted_radius` decides."""
+    lifted_radius: float = 0.0
+    """Spectral radius of the lifted system for `late_by`."""
+    probability_stable: float = 1.0
+    """Of a stable loop, given the losses that were seen; 1 or 0 where the channel is known."""
+    seconds_more: float | None = None
+    """How much longer to record [s] for a decision; None: unknown, or it would not help."""
+    seen: str = ""
+    """What was seen of the link, in a sentence."""
+    v_max: float = math.inf
+    """Limit on the speed [m/s]."""
+    infeasible: str = ""
+    """Why the loop does not settle even without losses."""
+    missing: int = 0
+    """Messages that are missing from the recording although no channel lost them."""
+    contradictions: tuple[str, ...] = ()
+    """How the recording contradicts what is known of the loop, a sentence each."""
+    repeated: RepeatedRun | None = None
+    """The nonlinear loop under these losses again and again; None where it could not be driven."""
+    twins: tuple[int, int] | None = None
+    """How many simulated runs of how many contract the distance of twins."""
 
 
-def judge_infeasible(why: str) -> Verdict:
-    """Verdict on a loop that does not settle even without losses: there is no motion about which it could be stable."""
-    return Verdict(INFEASIBLE, "nominal_motion", f"none: {why}")
+def decide(evidence: Evidence) -> Verdict:
+    """The word on a loop."""
+    if evidence.missing:
+        reason = f"{evidence.missing} messages are missing from the recording that no channel lost: it proves nothing"
+        return Verdict(UNKNOWN, "recording", f"unknown: {reason}", reason)
+    if evidence.infeasible:
+        return Verdict(INFEASIBLE, "nominal_motion", f"none: {evidence.infeasible}", evidence.infeasible)
+    if evidence.contradictions:
+        reason = evidence.contradictions[0]
+        return Verdict(UNKNOWN, "recording", f"unknown: {reason}", reason)
+    word = _by_criteria(evidence)
+    against = against_stability(evidence)
+    if word.word in (*GREEN, UNDECIDED) and against:
+        return _not_stable(evidence, "simulation", against)
+    return word
 
 
-def judge_late(n: int | None, radius: float, v_max: float) -> Verdict:
-    """Verdict on a run in which messages were late.
+def _by_criteria(evidence: Evidence) -> Verdict:
+    """The word by the linear criteria and by how much was seen of the link."""
+    if evidence.late_by is not None:
+        return _late(evidence)
+    if evidence.growth is None:
+        return Verdict(UNKNOWN, "none", f"unknown: {evidence.not_covered}", evidence.not_covered)
+    if evidence.probability_stable <= 1.0 - SURE:
+        return _not_stable(evidence, evidence.growth_of, _grows(evidence))
+    if evidence.probability_stable < SURE:
+        return _undecided(evidence)
+    is_survived = evidence.n_bursts is None or evidence.n <= evidence.n_bursts
+    if evidence.growth_of == "mean_square" and is_survived and not evidence.is_unlimited:
+        left = "any number of" if evidence.n_bursts is None else str(evidence.n_bursts - evidence.n)
+        plural = "s" if left != "1" else ""
+        reason = f"any sequence of outages of up to {evidence.n} slots is survived"
+        return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{plural}", _with_seen(reason, evidence))
+    if evidence.growth < 0.0:
+        return _mean_square(evidence)
+    return _not_stable(evidence, evidence.growth_of, _grows(evidence))
 
-    n: the constant outdatedness of the pose [slots], None if it was not constant or commands were late as well; radius:
-    spectral radius of the lifted system for it; v_max: limit on the speed [m/s].
-    """
-    if n is None:
-        return Verdict(UNKNOWN, "none", "unknown: messages were late, by no constant delay, which no criterion covers")
-    if radius < 1.0:
-        return Verdict(
-            ASYMPTOTIC, "lifted", f"each pose is {n} steps old, and the error shrinks; see n_max of stability"
-        )
-    late = f"none: each pose is {n} steps old, and the error grows"
-    if v_max < float("inf"):
-        return Verdict(BOUNDED, "v_max", f"{late}; only the limit on the speed bounds it")
-    return Verdict(UNSTABLE, "lifted", late)
+
+def _mean_square(evidence: Evidence) -> Verdict:
+    reason = _with_seen("under this link the mean square of the error dies out", evidence)
+    if evidence.growth_of == "both_links":
+        margin = "commands were lost as well; under both links the mean square of the error dies out"
+    elif evidence.growth_of != "mean_square":
+        margin = "messages were late; under ages like these the mean square of the error dies out"
+    else:
+        margin = _beyond(evidence)
+        if evidence.burst_left is not None:
+            margin += f"; outages may become {evidence.burst_left:.3g} times as long on average"
+    return Verdict(MEAN_SQUARE, evidence.growth_of, margin, reason)
 
 
-def judge_both_links(growth: float | None, policy: str, v_max: float) -> Verdict:
-    """Verdict on a run in which commands were lost.
+def _late(evidence: Evidence) -> Verdict:
+    age = f"each pose is {evidence.late_by} steps old"
+    if evidence.lifted_radius < 1.0:
+        shrinks = f"{age}, and the error shrinks"
+        return Verdict(ASYMPTOTIC, "lifted", f"{shrinks}; see n_max of stability", shrinks)
+    return _not_stable(evidence, "lifted", f"{age}, and the error grows")
 
-    growth: that of E[e^2] (logarithm, per step) under the channels fitted to both links, None if it is not computed for
-    this downlink policy; v_max: limit on the speed [m/s].
-    """
-    if growth is None:
-        return Verdict(
-            UNKNOWN, "none", f"unknown: commands were lost, and no criterion covers downlink policy {policy}"
-        )
-    if growth < 0.0:
-        dies_out = "the mean square of the error dies out" if policy == "hold" else "the error stays bounded on average"
-        return Verdict(MEAN_SQUARE, "both_links", f"commands were lost as well; under both fitted channels {dies_out}")
-    grows = "none: commands were lost as well, and under both fitted channels the mean square grows"
-    if v_max < float("inf"):
-        return Verdict(BOUNDED, "v_max", f"{grows}; only the limit on the speed bounds the error")
-    return Verdict(UNSTABLE, "both_links", grows)
+
+def _undecided(evidence: Evidence) -> Verdict:
+    reason = evidence.seen or f"a stable loop is {evidence.probability_stable:.0%} probable"
+    more = evidence.seconds_more
+    longer = "" if more is None else f"; record about {more:.3g} s more"
+    return Verdict(UNDECIDED, "confidence", f"unknown: {reason}{longer}", f"{reason}{longer}")
+
+
+def _not_stable(evidence: Evidence, criterion: str, why: str) -> Verdict:
+    """Bounded, where a limit on the speed keeps the error from growing in the simulation; else unstable."""
+    repeated = evidence.repeated
+    if math.isinf(evidence.v_max) or repeated is None or not repeated.stays:
+        return Verdict(UNSTABLE, criterion, f"none: {why}", why)
+    only = (
+        f"only the limit on the speed bounds the error, at {repeated.largest_deviation:.3g} m in "
+        f"{repeated.seconds:.0f} s of simulation"
+    )
+    return Verdict(BOUNDED, "v_max", f"none: {why}; {only}", f"{why}; {only}")
+
+
+def _grows(evidence: Evidence) -> str:
+    if evidence.growth_of == "both_links":
+        return "commands are lost as well, and under both links the mean square of the error grows"
+    if evidence.growth_of != "mean_square":
+        return "messages are late, and under ages like these the mean square of the error grows"
+    grows = "under this link the mean square of the error grows"
+    is_survived = evidence.n_bursts is None or evidence.n <= evidence.n_bursts
+    return _with_seen(grows if is_survived or evidence.is_unlimited else f"{_beyond(evidence)}, and {grows}", evidence)
+
+
+def _beyond(evidence: Evidence) -> str:
+    if evidence.is_unlimited:
+        return "outages of such a link have no longest one"
+    if evidence.n_bursts is None or evidence.n <= evidence.n_bursts:
+        return "any sequence of the outages seen is survived"
+    return f"the longest outage exceeds what any sequence of outages may have by {evidence.n - evidence.n_bursts}"
+
+
+def _with_seen(reason: str, evidence: Evidence) -> str:
+    return f"{reason}; {evidence.seen}" if evidence.seen else reason
+
+
+def against_stability(evidence: Evidence) -> str:
+    """What the simulation of the nonlinear loop says against a stable one; empty if nothing."""
+    repeated, twins = evidence.repeated, evidence.twins
+    if repeated is not None:
+        near = f"; after {repeated.seconds:.0f} s it is still up to {repeated.largest_deviation:.3g} m off"
+        if not repeated.settles:
+            return f"simulated without any loss the loop does not settle on its nominal motion{near}"
+        if not repeated.stays:
+            return "simulated under these losses again and again the deviation grows" + near
+        if not repeated.meets:
+            return "simulated under these losses, an AGV that begins on the track and this one do not come together"
+    if twins is not None and twins[0] < _SURE_OF_RUNS * twins[1]:
+        return f"simulated twins contract in {twins[0]} of {twins[1]} runs only"
+    return ""

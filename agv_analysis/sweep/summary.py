@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.run import Floats
 from agv_analysis.simulation.batch import Table
+from agv_analysis.stability.repeated_run import settles_without_losses
 from agv_analysis.sweep import METRICS
 from agv_analysis.sweep.plan import Sweep
 from agv_analysis.version import version
 
 
-def instability(table: Table) -> NDArray[np.bool_]:
-    """Is each run unstable: does it not contract the distance of twins that meet the same losses?"""
-    return np.asarray(~(table["contraction"] < 1.0))
+def instability(table: Table, settles: bool) -> NDArray[np.bool_]:
+    """Is each run of a point unstable: does it not contract the distance of twins that meet the same losses?
+
+    Where the loop does not even settle without losses every run is: twins may well come together while both drift away.
+    """
+    return np.asarray(~(table["contraction"] < 1.0) | (not settles))
 
 
 def summarise(sweep: Sweep, table: Table, done: NDArray[np.bool_]) -> list[dict[str, Any]]:
@@ -27,7 +31,8 @@ def summarise(sweep: Sweep, table: Table, done: NDArray[np.bool_]) -> list[dict[
 
 
 def _row(sweep: Sweep, point: int, runs: Table) -> dict[str, Any]:
-    unstable = int(np.count_nonzero(instability(runs)))
+    settles = settles_without_losses(sweep.scenario(point))
+    unstable = int(np.count_nonzero(instability(runs, settles)))
     low, high = clopper_pearson(unstable, len(runs))
     row: dict[str, Any] = {axis.name: value for axis, value in zip(sweep.axes, sweep.values(point), strict=True)}
     row |= {
@@ -36,6 +41,7 @@ def _row(sweep: Sweep, point: int, runs: Table) -> dict[str, Any]:
         "instability": unstable / len(runs),
         "instability_low": low,
         "instability_high": high,
+        "settles_without_losses": settles,
         "diverged": int(np.count_nonzero(np.isinf(runs["contraction"]))),
     }
     for metric in METRICS:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from agv_analysis.link.channel_fit import fit_channel
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.analysis import Analysis, analyse
-from agv_analysis.stability.verdict import judge
+from agv_analysis.stability.repeated_run import RepeatedRun
+from agv_analysis.stability.verdict import Evidence, decide
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import losses
 
@@ -74,24 +76,62 @@ def test_runs_that_say_little(lost: list[bool], model: str, rate: float) -> None
 # -- the verdict ------------------------------------------------------------------------------------------------------
 
 
+STAYS = RepeatedRun(600.0, settles=True, meets=True, stays=True, largest_deviation=0.3, largest_in_run=0.2)
+DRIFTS = dataclasses.replace(STAYS, stays=False, largest_deviation=40.0)
+
+
 @pytest.mark.parametrize(
-    ("arguments", "word", "margin"),
+    ("evidence", "word", "margin"),
     [
-        ((10, 14, -0.1, None, math.inf), "asymptotic", "4 more consecutive outages"),
-        ((13, 14, -0.1, None, math.inf), "asymptotic", "1 more consecutive outage"),
-        ((14, 14, -0.1, None, math.inf), "asymptotic", "0 more consecutive outages"),
-        ((10, None, -0.1, None, math.inf), "asymptotic", "any number of more consecutive outages"),
-        ((15, 14, -0.1, 2.0, math.inf), "mean-square", "by 1; outages may become 2 times"),
-        ((15, 14, 0.1, None, 6.0), "bounded", "limit on the speed"),
-        ((15, 14, 0.1, None, math.inf), "unstable", "mean square grows"),
+        (Evidence(n=10, n_bursts=14, growth=-0.1), "asymptotic", "4 more consecutive outages"),
+        (Evidence(n=13, n_bursts=14, growth=-0.1), "asymptotic", "1 more consecutive outage"),
+        (Evidence(n=14, n_bursts=14, growth=-0.1), "asymptotic", "0 more consecutive outages"),
+        (Evidence(n=10, n_bursts=None, growth=-0.1), "asymptotic", "any number of more consecutive outages"),
+        (Evidence(n=15, n_bursts=14, growth=-0.1, burst_left=2.0), "mean-square", "by 1; outages may become 2 times"),
+        (Evidence(n=10, n_bursts=14, growth=-0.1, is_unlimited=True), "mean-square", "no longest one"),
+        (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0, repeated=STAYS), "bounded", "limit on the speed"),
+        (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0, repeated=DRIFTS), "unstable", "mean square"),
+        (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0), "unstable", "mean square"),
+        (Evidence(n=15, n_bursts=14, growth=0.1), "unstable", "mean square of the error grows"),
+        (Evidence(n=5, growth_of="both_links", growth=-0.1), "mean-square", "commands were lost"),
+        (Evidence(n=5, growth=None, not_covered="nobody knows"), "unknown", "nobody knows"),
+        (Evidence(n=6, late_by=6, lifted_radius=0.9), "asymptotic", "6 steps old"),
+        (Evidence(n=6, late_by=6, lifted_radius=1.1), "unstable", "6 steps old"),
     ],
 )
-def test_the_strongest_statement_that_holds(
-    arguments: tuple[int, int | None, float, float | None, float], word: str, margin: str
-) -> None:
-    found = judge(*arguments)
+def test_the_strongest_statement_that_holds(evidence: Evidence, word: str, margin: str) -> None:
+    found = decide(evidence)
     assert found.word == word
     assert margin in found.margin
+    assert found.reason
+
+
+GREEN_SO_FAR = Evidence(n=10, n_bursts=14, growth=-0.1, repeated=STAYS)
+
+
+@pytest.mark.parametrize(
+    ("against", "word", "reason"),
+    [
+        ({"missing": 3}, "unknown", "3 messages are missing"),
+        ({"infeasible": "it falls behind"}, "infeasible", "it falls behind"),
+        ({"contradictions": ("driven with K_x = 50",)}, "unknown", "driven with K_x = 50"),
+        ({"probability_stable": 0.94, "seconds_more": 30.0}, "undecided", "record about 30 s more"),
+        ({"probability_stable": 0.5, "seen": "one outage"}, "undecided", "one outage"),
+        ({"probability_stable": 0.04}, "unstable", "mean square"),
+        ({"repeated": DRIFTS}, "unstable", "deviation grows"),
+        ({"repeated": dataclasses.replace(STAYS, settles=False)}, "unstable", "without any loss"),
+        ({"repeated": dataclasses.replace(STAYS, settles=False), "v_max": 2.0}, "bounded", "without any loss"),
+        ({"repeated": dataclasses.replace(STAYS, meets=False)}, "unstable", "do not come together"),
+        ({"repeated": DRIFTS, "probability_stable": 0.5}, "unstable", "deviation grows"),
+        ({"twins": (3, 20)}, "unstable", "3 of 20"),
+    ],
+)
+def test_any_evidence_to_the_contrary_wins_over_a_green_word(against: dict[str, Any], word: str, reason: str) -> None:
+    assert decide(GREEN_SO_FAR).word == "asymptotic"
+    assert decide(dataclasses.replace(GREEN_SO_FAR, probability_stable=0.95, twins=(19, 20))).word == "asymptotic"
+    found = decide(dataclasses.replace(GREEN_SO_FAR, **against))
+    assert found.word == word
+    assert reason in found.reason
 
 
 BURST_16 = ("relay.uplink.model=burst", "relay.uplink.n=16", "error_detector.track=line", "plant.duration=20.0")

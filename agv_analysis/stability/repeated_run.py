@@ -1,0 +1,285 @@
+"""The nonlinear loop under the very losses of a run, again and again: does it settle, forget where it began, stay near?
+
+The linear criteria say what a small error does about the nominal motion. Here the loop itself is driven, by the
+functions that the nodes call, for as many repetitions of the run's track and losses as ten minutes take:
+
+- without losses, from where the run began: does it come to its nominal motion?
+- with the losses, from where the run began and from the reference: do the two AGVs come together?
+- with the losses: does the largest deviation grow from one repetition to the next?
+
+Measurement noise and slip are left out: what a loop forgets does not depend on them.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.compiled import numbers
+from agv_analysis.metrics.convergence import body_errors, wrapped
+from agv_analysis.run import Floats, Run
+from agv_analysis.scenario import Scenario
+from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links
+from agv_analysis.simulation.loop import Loop, RunInputs, history
+from agv_analysis.simulation.parts import replacements_of, run_parts
+from agv_analysis.simulation.single import settings_of, start_of
+from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.scenario_loop import lap_of
+from agv_plant.channels.position_dependent import EVERYWHERE
+from agv_plant.parameters import RelayParameters
+from agv_plant.random_stream import DRAWS
+from agv_ros.pose import Pose
+
+SECONDS = 600.0
+"""Time [s] that is driven at least, in whole repetitions of the run, three of them at least."""
+
+_MOST_STEPS = 600_000
+
+_LAPS = 3
+"""Laps that are driven without losses."""
+
+_SETTLED = 1e-3
+"""Up to this distance [m, m, rad] from the nominal motion a loop has settled."""
+
+_MET = 1e-6
+"""Up to this distance [m, m, rad] two AGVs have met."""
+
+_APART = 1e-3
+"""An AGV that begins on the reference is held against one that begins this far [m, m, rad] away."""
+
+_SHRINKING = 0.9
+"""A distance that is below this share of what it was half the time before goes on shrinking."""
+
+_GROWING = 1.3
+"""A largest deviation above this multiple of the one a repetition before is growing."""
+
+
+@dataclass(frozen=True)
+class RepeatedRun:
+    """What the loop does in the repetitions of a run."""
+
+    seconds: float
+    """Time that was driven [s]."""
+    settles: bool
+    """Without losses: does the loop come from where the run began to its nominal motion?"""
+    meets: bool
+    """With the losses: do an AGV that begins where the run did and one on the reference come together?"""
+    stays: bool
+    """With the losses: is the largest deviation no larger from one repetition to the next?"""
+    largest_deviation: float
+    """Largest distance from the reference in the last repetition [m]; inf if the loop diverges."""
+    largest_in_run: float
+    """Largest distance from the reference in the second half of the first repetition, which is the run [m]."""
+
+    @property
+    def is_stable(self) -> bool:
+        """Do all three hold?"""
+        return self.settles and self.meets and self.stays
+
+
+def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
+    """Drive the repetitions of a run, with its linear loop over its steps.
+
+    None where steps are missing from the run, so that it cannot be repeated. Raises PartError if a part raises.
+    """
+    if int(run.k[-1] - run.k[0]) + 1 != len(run):
+        return None
+    steps = len(run)
+    count = min(max(3, math.ceil(SECONDS / (steps * run.ts))), max(3, _MOST_STEPS // steps))
+    reference = _repeated_reference(run.scenario, run.reference, count)
+    begun, other = _starts(run.scenario, run.pose[0], run.reference[0])
+    without = _without_losses(run.scenario, reference, begun, count * steps)
+    one, two = (_under_losses(run, reference, start, count) for start in (begun, other))
+    deviation = _deviation(one, reference)
+    before, last = _largest_of_last_two(deviation, steps)
+    return RepeatedRun(
+        seconds=count * steps * run.ts,
+        settles=_settles(without, reference, run.scenario, loop),
+        meets=_meets(one, two, _moved_by_commands(loop)),
+        stays=_does_not_grow(before, last),
+        largest_deviation=last,
+        largest_in_run=float(deviation[steps // 2 : steps].max()),
+    )
+
+
+def settles_without_losses(scenario: Scenario) -> bool:
+    """Does the loop, driven for three laps without losses, forget where it began and stay as near as it came?
+
+    By simulation alone, in milliseconds; `error_dynamics.nominal_motion` says where it settles, and why it does not.
+    Raises TrackFileError if the track's file cannot be used, PartError if a part raises.
+    """
+    relay = replace(RelayParameters(), ts=scenario.relay.ts, start_time=scenario.relay.start_time)
+    return _settles_without_losses(replace(scenario, relay=relay))  # the same whatever the links are
+
+
+@functools.lru_cache(maxsize=1024)
+def _settles_without_losses(scenario: Scenario) -> bool:
+    lap = lap_of(scenario)
+    reference = _repeated_reference(scenario, lap, _LAPS)
+    starts = _starts(scenario, np.array(scenario.plant.initial_pose), lap[0])
+    one, two = (_without_losses(scenario, reference, start, _LAPS * len(lap)) for start in starts)
+    moves = bool(lap[:, 3:].any())
+    return _does_not_grow(*_largest_of_last_two(_deviation(one, reference), len(lap))) and (
+        not moves or _meets(one, two, np.arange(3))
+    )
+
+
+def _repeated_reference(scenario: Scenario, rows: Floats, count: int) -> Floats:
+    """X_r(k) and its speeds over the repetitions, and as far beyond as the edge looks ahead, shape (N, 5).
+
+    After the rows, shape (n, 5), the reference goes on with their speeds from the beginning, by Euler's steps.
+    """
+    steps, ts = len(rows), scenario.plant.ts
+    total = count * steps + scenario.controller.steps_ahead
+    speeds = np.resize(rows[:, 3:], (total, 2))
+    x, y, theta = rows[-1, :3]
+    v, w = speeds[steps - 1 : total - 1].T
+    headings = theta + ts * np.concatenate(([0.0], np.cumsum(w)))
+    further = np.column_stack((
+        x + ts * np.cumsum(v * np.cos(headings[:-1])),
+        y + ts * np.cumsum(v * np.sin(headings[:-1])),
+        headings[1:],
+    ))  # fmt: skip
+    poses = np.concatenate((rows[:, :3], further))
+    return np.ascontiguousarray(np.column_stack((poses, speeds)))
+
+
+def _starts(scenario: Scenario, pose: Floats, reference: Floats) -> tuple[Loop, Loop]:
+    """The loop before the first step, its AGV at a pose, and at the reference or, if that is the same, beside it."""
+    begun, other = (_start(scenario, at) for at in (pose, reference))
+    if _distance(begun, other) < _APART:
+        other = _start(scenario, reference[:3] + _APART)
+    return begun, other
+
+
+def _start(scenario: Scenario, at: Floats) -> Loop:
+    x, y, theta = at[:3].tolist()
+    start, pose = start_of(scenario), Pose(x, y, theta)
+    return start._replace(
+        motion=start.motion._replace(x=x, y=y, theta=theta), edge=start.edge._replace(held=pose, target=pose)
+    )
+
+
+def _distance(one: Loop, other: Loop) -> float:
+    return max(abs(a - b) for a, b in zip(one.motion[:3], other.motion[:3], strict=True))
+
+
+def _without_losses(scenario: Scenario, reference: Floats, start: Loop, steps: int) -> Floats:
+    """Poses of the AGV, shape (N, 3); NaN after the loop has diverged."""
+    nothing = numbers(np.zeros(steps, dtype=np.bool_))
+    return _direct(scenario, reference, RunInputs(nothing, nothing, start, settings_of(scenario)))
+
+
+def _under_losses(run: Run, reference: Floats, start: Loop, count: int) -> Floats:
+    """As `_without_losses`, under the losses and delays of a run."""
+    lost, downlink_lost = (np.resize(outcomes, count * len(run)) for outcomes in (run.lost, run.downlink_lost))
+    inputs = RunInputs(numbers(lost), numbers(downlink_lost), start, settings_of(run.scenario))
+    if not _is_late(run):
+        return _direct(run.scenario, reference, inputs)
+    up, down = (_link(age, count) for age in (run.n_ul, _downlink_ages(run)))
+    traces, rows = (empty_trace(len(lost)), empty_trace(len(lost))), np.full((len(lost), 8), math.nan)
+    parts = replacements_of(run.scenario)
+    run_parts(history_over_links, parts, numbers(reference), inputs, up, down, *traces, rows)
+    return rows[:, :3]
+
+
+def _direct(scenario: Scenario, reference: Floats, inputs: RunInputs) -> Floats:
+    rows, n_ul = np.full((len(inputs.lost), 8), math.nan), np.empty(len(inputs.lost), dtype=np.int64)
+    run_parts(history, replacements_of(scenario), numbers(reference), inputs, rows, n_ul)
+    return rows[:, :3]
+
+
+def _largest_of_last_two(deviation: Floats, steps: int) -> tuple[float, float]:
+    """The largest deviation of the last repetition but one, and of the last."""
+    return float(deviation[-2 * steps : -steps].max()), float(deviation[-steps:].max())
+
+
+def _does_not_grow(before: float, last: float) -> bool:
+    return math.isfinite(last) and last <= max(_GROWING * before, before + _SETTLED)
+
+
+def _is_late(run: Run) -> bool:
+    """Does the age of what the receivers hold differ from what the outcomes of the slots say?"""
+    first = int(run.k[0])
+    up, down = (_ages_of(lost, first) for lost in (run.lost, run.downlink_lost))
+    return not (np.array_equal(run.n_ul, up) and np.array_equal(_downlink_ages(run), down))
+
+
+def _ages_of(lost: NDArray[np.bool_], first: int) -> NDArray[np.int64]:
+    k = np.arange(first, first + len(lost))
+    return np.asarray(k - np.maximum.accumulate(np.where(lost, first, k)), dtype=np.int64)
+
+
+def _downlink_ages(run: Run) -> NDArray[np.int64]:
+    return _ages_of(run.downlink_lost, int(run.k[0])) if run.n_dl is None else run.n_dl
+
+
+def _link(age: NDArray[np.int64], count: int) -> LinkInputs:
+    """A link under which the receiver holds, at each step of each repetition, a message of the age given, shape (N,).
+
+    Messages that never become the freshest are lost; at the beginning of a repetition nothing older than it is held.
+    """
+    steps = len(age)
+    within = np.arange(steps) - np.minimum(age, np.arange(steps))
+    held = np.maximum.accumulate(np.concatenate([within + i * steps for i in range(count)]))
+    taken, at = np.unique(held, return_index=True)
+    lost, waits = np.ones(count * steps, dtype=np.bool_), np.zeros(count * steps, dtype=np.int64)
+    lost[taken], waits[taken] = False, at - taken
+    return LinkInputs(
+        numbers(lost), EVERYWHERE, numbers(np.zeros((0, 5))), numbers(np.zeros((len(lost), 2))),
+        numbers(np.zeros((len(lost), DRAWS))), numbers(waits),
+    )  # fmt: skip
+
+
+def _deviation(poses: Floats, reference: Floats) -> Floats:
+    """Distance from the reference [m], shape (N,); inf where the loop has diverged."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.hypot(*(poses[:, :2] - reference[: len(poses), :2]).T)
+    return np.where(np.isfinite(apart), apart, math.inf)
+
+
+def _halfway_and_end(steps: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows halfway and at the end: a tenth of all before each of these."""
+    return np.arange(steps * 4 // 10, steps // 2), np.arange(steps * 9 // 10, steps)
+
+
+def _is_small_or_shrinks(halfway: Floats, end: Floats, small: float) -> bool:
+    """Is a distance below a size in the end, or does it go on shrinking? Shapes (N,)."""
+    before, after = float(np.median(halfway)), float(np.median(end))
+    return math.isfinite(after) and (after <= small or after < _SHRINKING * before)
+
+
+def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearLoop) -> bool:
+    if not np.isfinite(poses).all():
+        return False
+    ahead, columns = scenario.controller.steps_ahead, _moved_by_commands(loop)
+
+    def distance(rows: NDArray[np.int64]) -> Floats:
+        error = body_errors(reference[rows + ahead], poses[rows])
+        if loop.nominal is not None:
+            error = error - loop.nominal[rows % len(loop.nominal), :3]
+        error[:, 2] = wrapped(error[:, 2])
+        return np.asarray(np.abs(error[:, columns]).max(axis=1))
+
+    halfway, end = (distance(rows) for rows in _halfway_and_end(len(poses)))
+    return _is_small_or_shrinks(halfway, end, _SETTLED)
+
+
+def _meets(one: Floats, other: Floats, columns: NDArray[np.int64]) -> bool:
+    with np.errstate(over="ignore", invalid="ignore"):
+        apart = np.abs(one - other)
+    if not np.isfinite(apart).all():
+        return False
+    if len(columns) < apart.shape[1]:
+        return True
+    halfway, end = (apart[rows].max(axis=1) for rows in _halfway_and_end(len(apart)))
+    return _is_small_or_shrinks(halfway, end, _MET)
+
+
+def _moved_by_commands(loop: LinearLoop) -> NDArray[np.int64]:
+    """Which of x_e, y_e, theta_e the commands reach: a parked AGV keeps its error across for ever."""
+    return np.arange(min(3, loop.size))
