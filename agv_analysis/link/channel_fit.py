@@ -5,6 +5,10 @@ lost): the Gilbert channel, netem's gemodel with h = 0, k = 1. Given the first o
 are shares of transitions. Independent losses are the case p + r = 1 within it, so twice the difference of the log
 likelihoods is compared with the chi-square distribution of one degree of freedom.
 
+The share of lost slots has no binomial interval where losses come in bursts. Its interval, and that of the mean age of
+information, follow from the posterior of (p, r) given the transitions (`transitions`); where the outcomes are those of
+no such chain (`goodness_of_fit`), from parts of the recording drawn anew with random weights.
+
 Source: Anderson and Goodman, Statistical Inference about Markov Chains, Ann. Math. Stat. 28, 1957.
 """
 
@@ -16,16 +20,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.link.goodness_of_fit import Goodness, goodness_of_fit
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
+from agv_analysis.link.reception_intervals import Outcomes, Steps
+from agv_analysis.link.resampling import age_and_loss_samples
+from agv_analysis.link.transitions import Transitions, count_transitions, loss_rate, mean_age
 from agv_analysis.metrics.confidence import clopper_pearson
 
 SIGNIFICANCE = 0.01
 """Independent losses are rejected where outcomes this bursty would be rarer than this under them."""
 
 
+_TAIL = 0.0225
+"""Share of the posterior at each end that a 95 % interval leaves out, with some room for counts that are small."""
+
+
 @dataclass(frozen=True)
 class Estimate:
-    """A probability with its 95 % confidence interval."""
+    """A figure with its 95 % confidence interval."""
 
     value: float
     low: float
@@ -36,19 +48,30 @@ class Estimate:
         """Share of hits in independent trials, at least one; exact interval (Clopper and Pearson)."""
         return cls(hits / trials, *clopper_pearson(hits, trials))
 
+    @classmethod
+    def from_samples(cls, value: float, samples: NDArray[np.float64]) -> Estimate:
+        """The interval that holds all but a share of 2.25 % of the samples at each end, and the value."""
+        low, high = np.quantile(samples, [_TAIL, 1.0 - _TAIL])
+        return cls(value, min(value, float(low)), max(value, float(high)))
+
 
 @dataclass(frozen=True)
 class ChannelFit:
     """Both models as fitted, and which of them the outcomes support."""
 
     loss_rate: Estimate
-    """p of independent losses; its interval holds for these alone, bursts make the true one wider."""
+    """Share of the slots that were lost; the interval is that of the link's own rate, whatever the bursts."""
+    mean_age: Estimate
+    """E[n_ul] in steps; inf if nothing is ever received."""
     p: Estimate | None
     """Lost after delivered; None if nothing was delivered."""
     r: Estimate | None
     """Delivered after lost; None if nothing was lost."""
     p_value: float | None
     """Probability of outcomes this bursty (or this regular) if losses were independent; None without both outcomes."""
+    transitions: Transitions
+    goodness: Goodness
+    """Is a Gilbert channel, which independent losses are a case of, compatible with the outcomes?"""
 
     @property
     def model(self) -> str:
@@ -59,38 +82,61 @@ class ChannelFit:
 
     @property
     def chain(self) -> Chain:
-        """The fitted model as a Markov chain."""
+        """The fitted model as a Markov chain.
+
+        If no outage ended, r is not taken for 0, which nothing shows, but for what half a recovery would say.
+        """
         if self.model == "gilbert_elliott" and self.p is not None and self.r is not None:
-            return gilbert_elliott(self.p.value, self.r.value)
+            return gilbert_elliott(*self.transitions.estimate)
         return bernoulli(self.loss_rate.value)
 
     @property
     def mean_burst(self) -> float:
-        """Mean length of an outage in slots under the fitted model, inf if none ends, 0 without losses."""
+        """Mean length of an outage in slots under the fitted model, 0 without losses, inf if all is lost."""
         return self.chain.mean_burst
 
 
-def fit_channel(lost: NDArray[np.bool_]) -> ChannelFit:
-    """Fit to outcomes, True where lost, shape (N,), N >= 1."""
-    before, after = lost[:-1], lost[1:]
-    to_lost = int(np.count_nonzero(~before & after))
-    to_delivered = int(np.count_nonzero(before & ~after))
-    delivered, missed = int(np.count_nonzero(~before)), int(np.count_nonzero(before))
+def fit_channel(lost: Outcomes, k: Steps | None = None) -> ChannelFit:
+    """Fit to outcomes, True where lost, shape (N,), N >= 1.
+
+    They are those of the slots `k`, increasing; without `k` none is missing.
+    """
+    k = np.arange(len(lost)) if k is None else k
+    found, goodness = count_transitions(k, lost), goodness_of_fit(k, lost)
+    ages, rates = age_and_loss_samples(k, lost) if not goodness.fits else (None, None)
+    if ages is None or rates is None:
+        channels = found.posterior()
+        ages, rates = mean_age(*channels), loss_rate(*channels)
+    share = float(np.mean(lost))
     return ChannelFit(
-        loss_rate=Estimate.of(int(np.count_nonzero(lost)), len(lost)),
-        p=Estimate.of(to_lost, delivered) if delivered else None,
-        r=Estimate.of(to_delivered, missed) if missed else None,
-        p_value=_p_value(to_lost, delivered, to_delivered, missed) if delivered and missed else None,
+        loss_rate=Estimate.from_samples(share, rates),
+        mean_age=Estimate.from_samples(_mean_age(found, share), ages),
+        p=_of_trials(found.to_lost, found.delivered),
+        r=_of_trials(found.to_delivered, found.missed),
+        p_value=_p_value(found) if found.delivered and found.missed else None,
+        transitions=found,
+        goodness=goodness,
     )
 
 
-def _p_value(to_lost: int, delivered: int, to_delivered: int, missed: int) -> float:
-    lost = to_lost + missed - to_delivered
-    bursts = _log_likelihood(to_lost, delivered) + _log_likelihood(to_delivered, missed)
-    ratio = 2.0 * (bursts - _log_likelihood(lost, delivered + missed))
+def _of_trials(hits: float, trials: float) -> Estimate | None:
+    return Estimate.of(int(hits), int(trials)) if trials else None
+
+
+def _mean_age(found: Transitions, share: float) -> float:
+    """By the estimates of p and r; what nothing is known of is not made up."""
+    if share in (0.0, 1.0):
+        return 0.0 if share == 0.0 else math.inf
+    return float(mean_age(*found.estimate))
+
+
+def _p_value(found: Transitions) -> float:
+    lost = found.to_lost + found.missed - found.to_delivered
+    bursts = _log_likelihood(found.to_lost, found.delivered) + _log_likelihood(found.to_delivered, found.missed)
+    ratio = 2.0 * (bursts - _log_likelihood(lost, found.delivered + found.missed))
     return math.erfc(math.sqrt(max(0.0, ratio) / 2.0))  # chi-square of one degree: P(X^2 > ratio)
 
 
-def _log_likelihood(hits: int, trials: int) -> float:
+def _log_likelihood(hits: float, trials: float) -> float:
     """Largest log likelihood of `hits` in `trials`; 0 log 0 = 0."""
     return sum(count * math.log(count / trials) for count in (hits, trials - hits) if count)

@@ -206,7 +206,7 @@ def _finite(value: float) -> float | None:
 
 def observe(run: Run) -> Observations:
     """What can be seen in a run, be its gains known or not. Raises UserError if the run has no step."""
-    return Observations(run=run, outages=outages(run), convergence=convergence(run), fit=fit_channel(run.lost))
+    return Observations(run=run, outages=outages(run), convergence=convergence(run), fit=fit_channel(run.lost, run.k))
 
 
 def analyse(run: Run) -> Analysis:
@@ -231,10 +231,13 @@ def analyse(run: Run) -> Analysis:
 
 def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:
     """The fitted channel with the names of the relay's parameters, each with its 95 % interval."""
-    estimates = {"loss_rate": fit.loss_rate, "p": fit.p, "r": fit.r}
+    estimates = {"loss_rate": fit.loss_rate, "p": fit.p, "r": fit.r, "mean_age": fit.mean_age}
     return {
         "model": fit.model,
         "p_value": fit.p_value,
         "mean_burst": _finite(fit.mean_burst),
-        **{name: None if e is None else [e.value, e.low, e.high] for name, e in estimates.items()},
+        **{
+            name: None if e is None else [_finite(x) for x in (e.value, e.low, e.high)] for name, e in estimates.items()
+        },
+        "goodness": fit.goodness.to_json(),
     }

@@ -30,7 +30,7 @@ class RunFacts:
     def __init__(self, run: Run, found: Outages | None = None, fit: ChannelFit | None = None) -> None:
         self.run = run
         self.outages = outages(run) if found is None else found
-        self.fit = fit_channel(run.lost) if fit is None else fit
+        self.fit = fit_channel(run.lost, run.k) if fit is None else fit
         """The uplink as fitted to the run."""
         self.infeasible = ""
         """Why the loop has no motion about which it could be judged; empty if it has one."""
@@ -65,7 +65,7 @@ class RunFacts:
     @cached_property
     def downlink_fit(self) -> ChannelFit:
         """The downlink as fitted to the run."""
-        return fit_channel(self.run.downlink_lost)
+        return fit_channel(self.run.downlink_lost, self.run.k)
 
 
 def has_late(link: LinkSlots | None) -> bool:
