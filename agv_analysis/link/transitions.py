@@ -2,8 +2,8 @@
 
 With p = P(lost after delivered) and r = P(delivered after lost) the transitions are binomial counts, and given them p
 and r have independent beta distributions. Prior: p by Jeffreys, Beta(1/2, 1/2); r Beta(1/2, 1), uniform in sqrt(r),
-which expects longer outages than Jeffreys' prior does: a recording that has not shown how long outages are must not take
-them for short ones. A few outages outweigh either.
+which expects longer outages than Jeffreys' prior does: a recording that has not shown how long outages are must not
+take them for short ones. A few outages outweigh either.
 
 An outage that is still open where the recording ends adds slots that did not recover and nothing else, which is what a
 censored observation is. Pairs of slots with a step missing between them are no transitions.

@@ -236,8 +236,6 @@ def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:
         "model": fit.model,
         "p_value": fit.p_value,
         "mean_burst": _finite(fit.mean_burst),
-        **{
-            name: None if e is None else [_finite(x) for x in (e.value, e.low, e.high)] for name, e in estimates.items()
-        },
+        **{name: None if e is None else [*map(_finite, (e.value, e.low, e.high))] for name, e in estimates.items()},
         "goodness": fit.goodness.to_json(),
     }

@@ -47,11 +47,18 @@ def reception_maps(loop: LinearLoop, received: NDArray[np.int64], end: int) -> F
 
     `received` holds the steps of the receptions, increasing; steps beyond the lap are those of further laps.
     """
-    maps = np.empty((len(received), loop.size, loop.size))
-    F, G = loop.F, loop.G
+    return interval_maps(loop, received, np.diff(np.append(received, end)))
+
+
+def interval_maps(loop: LinearLoop, begins: NDArray[np.int64], lengths: NDArray[np.int64]) -> Floats:
+    """Maps of z over intervals that begin with a reception at the steps `begins`, which need not follow each other.
+
+    `lengths` in steps, >= 1, both of shape (n,); returns shape (n, m, m).
+    """
+    maps = np.empty((len(begins), loop.size, loop.size))
     H = np.empty((0, loop.outputs, loop.outputs)) if loop.H is None else loop.H
     K = np.empty((0, loop.outputs, loop.size)) if loop.K is None else loop.K
-    compiled(_fill_in_maps)(F, G, H, K, received, np.diff(np.append(received, end)), maps)
+    compiled(_fill_in_maps)(loop.F, loop.G, H, K, begins, lengths, maps)
     return maps
 
 

@@ -1,0 +1,34 @@
+"""Outages that repeat: the period of a recorded series of outcomes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.compiled import compiled
+from agv_analysis.link.reception_intervals import Outcomes, Steps
+
+_PERIODS = 3
+"""Fewest periods that a recording must show, and twice as many changes between lost and received."""
+
+
+def period_of(k: Steps, lost: Outcomes) -> int | None:
+    """Smallest number of slots after which all outcomes repeat; None if there is none, or steps are missing.
+
+    `k` and `lost` of shape (N,). Outcomes that are all the same have no outages that could repeat.
+    """
+    if np.any(np.diff(k) != 1) or np.count_nonzero(np.diff(lost)) < 2 * _PERIODS:
+        return None
+    borders = np.zeros(len(lost), dtype=np.int64)
+    period = int(compiled(_smallest_period)(np.ascontiguousarray(lost), borders))
+    return period if _PERIODS * period <= len(lost) else None
+
+
+def _smallest_period(lost: Outcomes, borders: NDArray[np.int64]) -> int:
+    """N less the longest proper border (Knuth, Morris and Pratt, SIAM J. Comput. 6, 1977)."""
+    for i in range(1, len(lost)):
+        length = borders[i - 1]
+        while length > 0 and lost[i] != lost[length]:
+            length = borders[length - 1]
+        borders[i] = length + 1 if lost[i] == lost[length] else length
+    return len(lost) - int(borders[-1])
