@@ -5,6 +5,9 @@ that spans it, linear between. What decides is on which side of the border they 
 which outages are too long, linear between in logarithms. All growths are moved such that they meet
 `mean_square.lap_growth` at the estimate.
 
+The probability is that of the posterior, or of one more pessimistic by about an outage, whichever is less sure: of
+recordings of a link just beyond the border less than 5 % are then called stable, however few outages they hold.
+
 How much longer to record: until the posterior that the same transitions would leave, had they been so many times as
 many, is sure.
 """
@@ -26,11 +29,13 @@ from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 SURE = 0.95
 """Probability from which on a word is given."""
 
-_COARSE = (0.0005, 0.5, 0.9995)
+_COARSE = (0.0005, 0.025, 0.5, 0.975, 0.9995)
 _FINE = (0.0005, 0.025, 0.1, 0.3, 0.6, 0.9, 0.975, 0.9995)
 """Quantiles of the posterior that the grid's lines go through."""
 
 _BISECTIONS = 6
+
+_POSTERIORS = (Transitions.posterior, Transitions.pessimistic_posterior)
 
 _RARER = 1e-3
 """A further line at so many times the smallest p: what a longer recording without an outage would leave."""
@@ -61,7 +66,7 @@ class GrowthPosterior:
 
     @property
     def probability_stable(self) -> float:
-        """P(E[e^2] dies out | data)."""
+        """P(E[e^2] dies out | data), cautiously."""
         return self._probability(self.transitions)
 
     def times_longer(self) -> float | None:
@@ -73,9 +78,12 @@ class GrowthPosterior:
         return None
 
     def _probability(self, transitions: Transitions) -> float:
-        p, r = transitions.posterior()
-        log_p, _, _ = self._grid
-        return float(np.mean(np.log(r) > np.interp(np.log(p), log_p, self._border)))
+        """That of the less sure of two posteriors, 1/2 if they do not agree."""
+        stable = [self._share_above_border(*draws(transitions)) for draws in _POSTERIORS]
+        return sorted((*stable, 0.5))[1]
+
+    def _share_above_border(self, p: Floats, r: Floats) -> float:
+        return float(np.mean(np.log(r) > np.interp(np.log(p), self._grid[0], self._border)))
 
     @cached_property
     def _border(self) -> Floats:
@@ -100,7 +108,7 @@ class GrowthPosterior:
     @cached_property
     def _grid(self) -> tuple[Floats, Floats, Floats]:
         """Nodes log p and log r, and the growths, shape (nodes of p, nodes of r)."""
-        p, r = self.transitions.posterior()
+        p, r = np.hstack([draws(self.transitions) for draws in _POSTERIORS])
         grid = self._growths_at(np.quantile(p, _COARSE), np.quantile(r, _COARSE))
         if np.ptp(np.sign(grid[2])) == 0.0:
             return grid
