@@ -18,21 +18,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.link.goodness_of_fit import Goodness, goodness_of_fit
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.resampling import age_and_loss_samples
-from agv_analysis.link.transitions import Transitions, count_transitions, loss_rate, mean_age
+from agv_analysis.link.transitions import TAIL, Transitions, count_transitions, interval_of, loss_rate, mean_age
 from agv_analysis.metrics.confidence import clopper_pearson
+from agv_analysis.run import Floats
 
 SIGNIFICANCE = 0.01
 """Independent losses are rejected where outcomes this bursty would be rarer than this under them."""
-
-
-_TAIL = 0.0225
-"""Share of the posterior at each end that a 95 % interval leaves out, with some room for counts that are small."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +45,9 @@ class Estimate:
         return cls(hits / trials, *clopper_pearson(hits, trials))
 
     @classmethod
-    def from_samples(cls, value: float, samples: NDArray[np.float64]) -> Estimate:
-        """The interval that holds all but a share of 2.25 % of the samples at each end, and the value."""
-        low, high = np.quantile(samples, [_TAIL, 1.0 - _TAIL])
-        return cls(value, min(value, float(low)), max(value, float(high)))
+    def about(cls, value: float, low: float, high: float) -> Estimate:
+        """A value, and an interval that is made to hold it."""
+        return cls(value, min(value, low), max(value, high))
 
 
 @dataclass(frozen=True)
@@ -104,19 +99,23 @@ def fit_channel(lost: Outcomes, k: Steps | None = None) -> ChannelFit:
     k = np.arange(len(lost)) if k is None else k
     found, goodness = count_transitions(k, lost), goodness_of_fit(k, lost)
     ages, rates = age_and_loss_samples(k, lost) if not goodness.fits else (None, None)
-    if ages is None or rates is None:
-        channels = found.posterior()
-        ages, rates = mean_age(*channels), loss_rate(*channels)
     share = float(np.mean(lost))
     return ChannelFit(
-        loss_rate=Estimate.from_samples(share, rates),
-        mean_age=Estimate.from_samples(_mean_age(found, share), ages),
+        loss_rate=Estimate.about(share, *(interval_of(found, loss_rate) if rates is None else _quantiles(rates))),
+        mean_age=Estimate.about(
+            _mean_age(found, share), *(interval_of(found, mean_age) if ages is None else _quantiles(ages))
+        ),
         p=_of_trials(found.to_lost, found.delivered),
         r=_of_trials(found.to_delivered, found.missed),
         p_value=_p_value(found) if found.delivered and found.missed else None,
         transitions=found,
         goodness=goodness,
     )
+
+
+def _quantiles(samples: Floats) -> tuple[float, float]:
+    low, high = np.quantile(samples, [TAIL, 1.0 - TAIL])
+    return float(low), float(high)
 
 
 def _of_trials(hits: float, trials: float) -> Estimate | None:

@@ -14,6 +14,7 @@ and DasGupta, Interval Estimation for a Binomial Proportion, Stat. Science 16, 2
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -24,6 +25,12 @@ from agv_analysis.run import Floats
 
 SAMPLES = 4000
 """Channels drawn from a posterior: probabilities are good to 0.005, at 0.95 to 0.003."""
+
+TAIL = 0.0225
+"""Share of a posterior at each end that a 95 % interval leaves out, with some room for counts that are small."""
+
+_FEW = 10
+"""Outages below which the interval's upper end is that of the more pessimistic posterior."""
 
 _SEED = 1
 
@@ -79,6 +86,15 @@ class Transitions:
         p = rng.beta(begun, self.delivered - self.to_lost + 0.5, size)
         r = rng.beta(ended, self.missed - self.to_delivered + 1.0, size)
         return np.clip(p, 1e-300, 1.0), np.clip(r, 1e-300, 1.0)
+
+
+def interval_of(transitions: Transitions, figure: Callable[[Floats, Floats], Floats]) -> tuple[float, float]:
+    """95 % interval of a figure of Gilbert channels (p, r), larger for more losses; wider upwards for few outages."""
+    drawn = figure(*transitions.posterior())
+    low, high = np.quantile(drawn, [TAIL, 1.0 - TAIL])
+    if transitions.to_lost < _FEW:
+        high = max(high, np.quantile(figure(*transitions.pessimistic_posterior()), 1.0 - TAIL))
+    return float(low), float(high)
 
 
 def count_transitions(k: Steps, lost: Outcomes) -> Transitions:

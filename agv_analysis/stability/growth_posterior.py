@@ -3,7 +3,7 @@
 The posterior of (p, r) given the transitions is one of the growth, by `gilbert_growths` on a grid of (log p, log r)
 that spans it, linear between. What decides is on which side of the border they lie: for each p of the grid the r* below
 which outages are too long, linear between in logarithms. All growths are moved such that they meet
-`mean_square.lap_growth` at the estimate.
+`mean_square.lap_growth` at the estimate of the whole recording.
 
 The probability is that of the posterior, or of one more pessimistic by about an outage, whichever is less sure: of
 recordings of a link just beyond the border less than 5 % are then called stable, however few outages they hold.
@@ -19,8 +19,8 @@ from functools import cached_property
 
 import numpy as np
 
-from agv_analysis.link.markov_channel import bernoulli, gilbert_elliott
-from agv_analysis.link.transitions import Transitions
+from agv_analysis.link.markov_channel import gilbert_elliott
+from agv_analysis.link.transitions import Transitions, interval_of
 from agv_analysis.run import Floats
 from agv_analysis.stability import mean_square
 from agv_analysis.stability.gilbert_growth import gilbert_growths
@@ -50,19 +50,19 @@ class GrowthPosterior:
 
     loop: LinearLoop
     transitions: Transitions
+    move: float = 0.0
+    """As of `moved`: what is added to all growths."""
 
     @cached_property
     def estimate(self) -> float:
         """Growth (logarithm, per step) under the estimate of (p, r)."""
-        p, r = self.transitions.estimate
-        chain = gilbert_elliott(p, r) if p > 0.0 else bernoulli(0.0)
-        return mean_square.lap_growth(self.loop, chain) / self.loop.steps
+        return float(self._growths(*_as_arrays(self.transitions))[0])
 
     @cached_property
-    def samples(self) -> Floats:
-        """Growths under draws from the posterior."""
-        p, r = self.transitions.posterior()
-        return _bilinear(np.log(p), np.log(r), *self._grid)
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the growth, about the estimate."""
+        low, high = interval_of(self.transitions, lambda p, r: _bilinear(np.log(p), np.log(r), *self._grid))
+        return min(self.estimate, low), max(self.estimate, high)
 
     @property
     def probability_stable(self) -> float:
@@ -98,7 +98,7 @@ class GrowthPosterior:
         low, high, f_low, f_high = log_r[last], log_r[last + 1], growths[rows, last], growths[rows, last + 1]
         for _ in range(_BISECTIONS):
             at = (low * f_high - high * f_low) / (f_high - f_low)
-            f = self._moved(np.exp(log_p[rows]), np.exp(at))
+            f = self._growths(np.exp(log_p[rows]), np.exp(at))
             above = f < MARGINAL
             f_low, f_high = np.where(above, 0.5 * f_low, f), np.where(above, f, 0.5 * f_high)
             low, high = np.where(above, low, at), np.where(above, at, high)
@@ -117,16 +117,23 @@ class GrowthPosterior:
 
     def _growths_at(self, p: Floats, r: Floats) -> tuple[Floats, Floats, Floats]:
         at_p, at_r = (axis.ravel() for axis in np.meshgrid(p, r, indexing="ij"))
-        return np.log(p), np.log(r), self._moved(at_p, at_r).reshape(len(p), len(r))
+        return np.log(p), np.log(r), self._growths(at_p, at_r).reshape(len(p), len(r))
 
-    def _moved(self, p: Floats, r: Floats) -> Floats:
-        return gilbert_growths(self.loop, p, r) + self._move
+    def _growths(self, p: Floats, r: Floats) -> Floats:
+        return gilbert_growths(self.loop, p, r) + self.move
 
-    @cached_property
-    def _move(self) -> float:
-        """What the mean over a few places of the lap leaves out, at the estimate."""
-        p, r = (np.array([max(value, 1e-12)]) for value in self.transitions.estimate)
-        return self.estimate - float(gilbert_growths(self.loop, p, r)[0]) if np.isfinite(self.estimate) else 0.0
+
+def moved(loop: LinearLoop, transitions: Transitions) -> float:
+    """What the mean over a few places of the lap leaves out of the growth per step, at the estimate of (p, r)."""
+    if loop.is_constant or transitions.to_lost == 0:
+        return 0.0
+    exact = mean_square.lap_growth(loop, gilbert_elliott(*transitions.estimate)) / loop.steps
+    return exact - float(gilbert_growths(loop, *_as_arrays(transitions))[0]) if np.isfinite(exact) else 0.0
+
+
+def _as_arrays(transitions: Transitions) -> tuple[Floats, Floats]:
+    p, r = transitions.estimate
+    return np.array([p]), np.array([r])
 
 
 def _bilinear(x: Floats, y: Floats, x_nodes: Floats, y_nodes: Floats, values: Floats) -> Floats:

@@ -26,12 +26,22 @@ from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.moment_operators import log_radius, places, symmetric_operator
 from agv_analysis.stability.reception_maps import interval_maps
 
-_SAMPLES = 300
+_SAMPLES = 200
 
 _SEED = 1
 
 _BLOCKS = 30
 """Fewest blocks of intervals whose mean says anything."""
+
+_SHORTEST = 4
+"""Intervals of the shortest block."""
+
+_PLACES_OF_BLOCKS = 3
+
+_WINDOW = 8
+"""Intervals of a stretch that is looked at by itself."""
+
+_WINDOWS = 40
 
 _TILTS = 4
 
@@ -79,17 +89,37 @@ def _of_independent(loop: LinearLoop, steps: NDArray[np.int64], lengths: Lengths
 
 def _of_blocks(loop: LinearLoop, steps: NDArray[np.int64], lengths: Lengths) -> list[IntervalGrowth]:
     values, which = np.unique(lengths, return_inverse=True)
+    steps = steps[:_PLACES_OF_BLOCKS]
     maps = np.stack([interval_maps(loop, np.full(len(values), k), values)[which] for k in steps])
     spans, block, found = lengths.astype(np.float64), 1, []
     while len(spans) // 2 >= _BLOCKS:
         even = len(spans) & ~1
         maps, spans, block = maps[:, 1:even:2] @ maps[:, 0:even:2], spans[0:even:2] + spans[1:even:2], 2 * block
+        if block < _SHORTEST and len(spans) // 2 >= _BLOCKS:
+            continue
         worst = int(np.argmax(np.abs(maps).max(axis=(0, 2, 3))))
         operators = symmetric_operator(np.concatenate((maps, maps[:, worst : worst + 1]), axis=1))
         rng = np.random.default_rng(_SEED)
         weights = np.column_stack((rng.standard_exponential((_SAMPLES, len(spans))), _unseen(rng)))
         found.append(_growths(operators, np.full(len(spans), 1.0 / len(spans)), weights, spans, block))
     return found
+
+
+def grows_for_a_while(loop: LinearLoop, lengths: Lengths) -> bool:
+    """Are there some successive intervals among `lengths`, (n,), under whose mean operator E[e^2] grows?
+
+    Even without the longest of them: more than one outage. Where intervals depend on each other, the link may stay in
+    such a state, and how long it stays decides.
+    """
+    if len(lengths) < _WINDOW:
+        return False
+    windows = np.lib.stride_tricks.sliding_window_view(lengths, _WINDOW)
+    sums = (windows.astype(np.float64) ** 2).sum(axis=1) - windows.max(axis=1).astype(np.float64) ** 2
+    chosen = np.sort(windows[np.argsort(-sums)[:_WINDOWS]], axis=1)[:, :-1]
+    values, which = np.unique(chosen, return_inverse=True)
+    operators = _operators(loop, places(loop)[:_PLACES_OF_BLOCKS], values)
+    means = operators[:, which.reshape(chosen.shape)].mean(axis=2)
+    return bool((log_radius(means).mean(axis=0) >= 0.0).any())
 
 
 def _operators(loop: LinearLoop, steps: NDArray[np.int64], values: Lengths) -> Floats:

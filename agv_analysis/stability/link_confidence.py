@@ -22,6 +22,8 @@ from agv_analysis.link.change_points import Segment, Stationarity, stationarity
 from agv_analysis.link.goodness_of_fit import Goodness
 from agv_analysis.link.periodic_outages import period_of
 from agv_analysis.link.reception_intervals import Outcomes, Steps
+from agv_analysis.link.transitions import count_transitions
+from agv_analysis.stability.growth_posterior import moved
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.segment_confidence import SegmentConfidence, segment_confidence
 
@@ -122,5 +124,7 @@ def link_confidence(loop: LinearLoop, k: Steps, lost: Outcomes, ts: float) -> Li
         raise ValueError(f"ts must be the loop's, {loop.ts}, got {ts}")
     is_periodic = period_of(k, lost) is not None
     found = Stationarity(None, (), (Segment(0, len(k)),)) if is_periodic else stationarity(k, lost)
+    move = moved(loop, count_transitions(k, lost))
     parts = (slice(segment.begin, segment.end) for segment in found.segments)
-    return LinkConfidence(tuple(segment_confidence(loop, k[part], lost[part], int(k[0])) for part in parts), found)
+    judged = (segment_confidence(loop, k[part], lost[part], int(k[0]), move) for part in parts)
+    return LinkConfidence(tuple(judged), found)

@@ -18,7 +18,7 @@ from agv_analysis.run import Floats
 from agv_analysis.stability import mean_square
 from agv_analysis.stability.floquet import drop_sequence
 from agv_analysis.stability.growth_posterior import SURE, GrowthPosterior
-from agv_analysis.stability.interval_growth import IntervalGrowth, interval_growth
+from agv_analysis.stability.interval_growth import IntervalGrowth, grows_for_a_while, interval_growth
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 
 GILBERT, RENEWAL, BLOCKS, PERIODIC, PREDICTED = (
@@ -34,6 +34,11 @@ _INTERVALS = 20
 """Fewest intervals between receptions, and outages, that are judged without a model."""
 
 _LONGEST = 300.0
+
+_HEAVY = "the longest outages are so long beside the others that their mean square may not exist"
+
+_ADVANTAGE = 2.0
+"""Log likelihood by which a heavy tail must be the likelier where geometric outages are not rejected."""
 
 _FEW = 5
 """Outages below which a recording has seen few."""
@@ -81,11 +86,14 @@ class _Found:
     why: str
 
 
-def segment_confidence(loop: LinearLoop, k: Steps, lost: Outcomes, first: int) -> SegmentConfidence:
-    """Judge the outcomes of slots `k`, increasing, shape (N,), N >= 1, of a recording whose first step is `first`."""
+def segment_confidence(loop: LinearLoop, k: Steps, lost: Outcomes, first: int, move: float) -> SegmentConfidence:
+    """Judge the outcomes of slots `k`, increasing, shape (N,), N >= 1, of a recording whose first step is `first`.
+
+    `move` as of `growth_posterior.moved`.
+    """
     intervals = reception_intervals(k, lost)
     goodness = goodness_of_intervals(intervals)
-    found = _judge(loop, k, lost, intervals, goodness)
+    found = _judge(loop, k, lost, intervals, goodness, move)
     seconds = len(k) * loop.ts
     decided = not 1.0 - SURE < found.probability_stable < SURE
     more = None if decided or found.times_longer is None else (found.times_longer - 1.0) * seconds
@@ -105,7 +113,7 @@ def segment_confidence(loop: LinearLoop, k: Steps, lost: Outcomes, first: int) -
     )
 
 
-def _judge(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals, goodness: Goodness) -> _Found:
+def _judge(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals, goodness: Goodness, move: float) -> _Found:
     if loop.is_exact:
         return _of_exact_predictor(loop, lost)
     period = period_of(k, lost)
@@ -113,7 +121,8 @@ def _judge(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals, goo
         return _of_period(loop, lost, period)
     enough = min(len(intervals.between_receptions), 4 * len(intervals.outages)) >= _INTERVALS
     if goodness.fits or not enough:
-        return _of_gilbert(loop, k, lost, intervals, goodness)
+        posterior = GrowthPosterior(loop, count_transitions(k, lost), move)
+        return _of_gilbert(posterior, intervals, goodness)
     return _of_intervals(loop, intervals, goodness)
 
 
@@ -144,8 +153,7 @@ def _whole(loop: LinearLoop, period: int) -> int:
     return period if loop.is_constant else period * max(1, round(loop.steps / period))
 
 
-def _of_gilbert(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals, goodness: Goodness) -> _Found:
-    posterior = GrowthPosterior(loop, count_transitions(k, lost))
+def _of_gilbert(posterior: GrowthPosterior, intervals: Intervals, goodness: Goodness) -> _Found:
     probability, count = posterior.probability_stable, len(intervals.outages)
     if goodness.fits:
         why = f"a Gilbert channel describes the outcomes, of {_counted(count, 'complete outage')}"
@@ -158,11 +166,11 @@ def _of_gilbert(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals
         why = f"a Gilbert channel does not describe the outcomes, and {_counted(count, 'complete outage')} are too few"
     if intervals.longest_open and intervals.longest_open >= intervals.outages.max(initial=0):
         why += f"; an outage of at least {intervals.longest_open} slots was not seen whole"
+    if goodness.fits and tail_is_heavy(intervals.outages, _ADVANTAGE):
+        probability, why = min(probability, 0.5), _HEAVY
     undecided = 1.0 - SURE < probability < SURE
     longer = posterior.times_longer() if undecided and goodness.fits else None
-    return _Found(
-        GILBERT, probability, posterior.estimate, _interval(posterior.estimate, posterior.samples), longer, why
-    )
+    return _Found(GILBERT, probability, posterior.estimate, posterior.interval, longer, why)
 
 
 def _of_intervals(loop: LinearLoop, intervals: Intervals, goodness: Goodness) -> _Found:
@@ -176,11 +184,14 @@ def _of_intervals(loop: LinearLoop, intervals: Intervals, goodness: Goodness) ->
         why += f", {found.block} at a time, because they depend on each other"
     if heavy:
         probability = min(probability, 0.5)
-        why = "the longest outages are so long that their mean square may not exist"
+        why = _HEAVY
+    elif probability > 0.5 and dependent and grows_for_a_while(loop, lengths):
+        probability = 0.5
+        why = "outages come in clusters within which the error grows, and it is not known how long these may last"
     elif probability < SURE and _share_of_longest(intervals) > 0.2:
         why += f"; the longest outage of {intervals.longest} slots alone makes up {_share_of_longest(intervals):.0%} "
         why += "of the sum of their squares"
-    longer = None if heavy else _times_longer(found, probability)
+    longer = None if heavy or probability == 0.5 else _times_longer(found, probability)
     return _Found(
         RENEWAL if found.block == 1 else BLOCKS, probability, found.growth, _interval(found.growth, found.samples),
         longer, why,
