@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,19 @@ class LinkSlots:
     """The channel's gain [dB] over its mean, shape (N,); NaN where it has none."""
     delay: NDArray[np.int64]
     """Slots that the message is under way, 0 if it comes in its own slot or not at all, shape (N,)."""
+
+
+@dataclass(frozen=True)
+class ParameterChange:
+    """A parameter of a node of the loop that was changed while the loop ran."""
+
+    k: int
+    """First step with the new value."""
+    node: str
+    """As in Scenario: plant, relay, error_detector, controller."""
+    name: str
+    old: Any
+    new: Any
 
 
 @dataclass(frozen=True)
@@ -61,6 +75,10 @@ class Run:
     """What a reader must know of the recording: damage, repeated steps, parameters that do not fit."""
     measured: Floats | None = None
     """The poses that the AGV measured and sent, shape (N, 3), where they are not the true ones; see `sent_pose`."""
+    error_speeds: Floats | None = None
+    """v_r, w_r as the edge sent them with each error, shape (N, 2); None: those of the reference compared with."""
+    parameter_changes: tuple[ParameterChange, ...] = ()
+    """Parameters that were changed while the run went on, by step; `scenario` has the values that it began with."""
     gains_known: bool = True
     """Are the gains and limits in `scenario.controller` those of the run? Else they mean nothing."""
     seed_known: bool = True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -75,6 +75,14 @@ class Scenario:
         Raises ParameterError.
         """
         return Scenario(**resolve(SCHEMAS, self._sections(), settings, name))
+
+    def with_values(self, values: Mapping[str, Mapping[str, Any]], name: str = "scenario") -> Scenario:
+        """The scenario with other values of parameters, by node and name, called `name` in messages.
+
+        Raises ParameterError.
+        """
+        own = self._sections()
+        return Scenario(**resolve(SCHEMAS, {node: own[node] | dict(values.get(node, {})) for node in own}, (), name))
 
     def to_yaml(self, of_all_parts: bool = False) -> str:
         """The whole scenario as a ROS 2 params file, with every default written out.

@@ -12,8 +12,9 @@ from agv_analysis.commands import needs_ros, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
-    from agv_analysis.runtime.edge_comparison import Comparison, Difference
+    from agv_analysis.runtime.edge_comparison import Comparison
     from agv_analysis.scenario import Scenario
+    from agv_analysis.simulation.edge_answers import Difference
 
 
 @click.command("replay")

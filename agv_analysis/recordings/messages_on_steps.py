@@ -99,6 +99,11 @@ def errors_of(messages: OnSteps, k: Steps) -> Floats:
     return np.column_stack([*position, _yaws(messages, "pose.pose", k)])
 
 
+def speeds_of_errors(messages: OnSteps, k: Steps) -> Floats:
+    """The reference's speeds (v_r, w_r) as the edge sent them with its errors, shape (N, 2)."""
+    return np.column_stack([messages.column(f"twist.twist.{speed}", k) for speed in ("linear.x", "angular.z")])
+
+
 def commands_of(messages: OnSteps, k: Steps) -> Floats:
     """Commands (v, w), shape (N, 2)."""
     return np.column_stack([messages.column("twist.linear.x", k), messages.column("twist.angular.z", k)])

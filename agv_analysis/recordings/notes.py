@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-import numpy as np
-
 from agv_analysis.bags import Bag
 from agv_analysis.bags.writer import METADATA_NAME, REPLAY_OF
-from agv_analysis.metrics.convergence import body_errors, wrapped
 from agv_analysis.recordings.messages_on_steps import OnSteps
 from agv_analysis.run import Run
-
-_SAME_ERROR = 1e-6
-"""Largest difference [m, rad] between a recorded tracking error and the one that follows from track and pose."""
+from agv_analysis.stability.driven_commands import driven_commands, wrong_errors
 
 
 def of_replay(bag: Bag) -> Iterator[str]:
@@ -45,17 +40,17 @@ def of_messages(on_steps: Mapping[str, OnSteps], names: Mapping[str, str]) -> It
 
 
 def of_mismatch(run: Run) -> Iterator[str]:
-    """A warning if the recorded errors do not belong to the track that the parameters name."""
-    held = np.searchsorted(run.k, run.k - run.n_ul)
-    known = (held < len(run)) & np.isfinite(run.error[:, 0])
-    known[known] &= run.k[held[known]] == (run.k - run.n_ul)[known]
-    eps = body_errors(run.reference[known], run.sent_pose[held[known]])
-    difference = run.error[known] - eps
-    difference[:, 2] = wrapped(difference[:, 2])
-    scale = 1.0 + np.abs(run.sent_pose[held[known], :2]).max(axis=1, initial=0.0)
-    wrong = np.count_nonzero(np.abs(difference).max(axis=1, initial=0.0) > _SAME_ERROR * scale)
+    """A warning if the recorded errors do not belong to the track and the policy that the parameters name."""
+    wrong, count = wrong_errors(run)
     if wrong:
         yield (
-            f"{wrong} of {len(eps)} recorded errors do not fit the track in the parameters: are these the run's "
+            f"{wrong} of {count} recorded errors do not fit the track in the parameters: are these the run's "
             "parameters, and did anything else publish poses?"
         )
+
+
+def of_commands(run: Run) -> Iterator[str]:
+    """A warning if the recorded commands are not those of the control law that the parameters name."""
+    driven = driven_commands(run)
+    if driven.sentence:
+        yield driven.sentence

@@ -20,6 +20,7 @@ from agv_analysis.recordings.messages_on_steps import (
     errors_of,
     on_steps,
     postures,
+    speeds_of_errors,
 )
 from agv_analysis.recordings.slot_outcomes import slot_outcomes
 from agv_analysis.run import Floats, Run
@@ -111,6 +112,7 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         measured=sent if is_true_known else None,
         reference=_reference(topics, k, scenario, source),
         error=errors_of(topics["edge/error"], k),
+        error_speeds=speeds_of_errors(topics["edge/error"], k),
         command=commands_of(topics["edge/cmd_vel"], k),
         n_ul=n_ul,
         lost=lost,
@@ -123,7 +125,7 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
     )
     unknown = () if is_true_known or not scenario.plant.is_noisy else (_NO_TRUTH,)
     of_run = (*notes.of_replay(bag), *notes.of_first_step(run))
-    of_content = (*notes.of_messages(topics, names), *notes.of_mismatch(run))
+    of_content = (*notes.of_messages(topics, names), *notes.of_mismatch(run), *notes.of_commands(run))
     return dataclasses.replace(run, notes=(*bag.problems, *of_run, *of_content, *unknown))
 
 
@@ -141,6 +143,7 @@ def _reference(topics: Mapping[str, OnSteps], k: Steps, scenario: Scenario, sour
             f"{source}: the reference came as a path while the loop ran, and nothing of it is on edge/reference_pose: "
             "without it there is nothing to compare the poses with"
         )
-    speeds = [errors.column(f"twist.twist.{speed}", known) for speed in ("linear.x", "angular.z")]
-    rows = np.column_stack([postures(poses, "pose", known, scenario.plant.initial_pose[2]), *speeds])
+    rows = np.column_stack(
+        [postures(poses, "pose", known, scenario.plant.initial_pose[2]), speeds_of_errors(errors, known)]
+    )
     return np.column_stack([np.interp(k, known, column) for column in rows.T])
