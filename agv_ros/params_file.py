@@ -72,7 +72,7 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _is_ros_own(name: str) -> bool:
+def is_ros_own(name: str) -> bool:
     """Parameters that every rclpy node has without declaring them here."""
     return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")
 
@@ -144,7 +144,7 @@ def _from_file(node: str, schema: type, sections: Mapping[str, Mapping[str, Any]
         if title == "/**":
             merged.update({name: value for name, value in section.items() if name in known})
         elif title == node:
-            merged.update({name: value for name, value in section.items() if not _is_ros_own(name)})
+            merged.update({name: value for name, value in section.items() if not is_ros_own(name)})
     return check_values(schema, merged, node)
 
 
@@ -152,7 +152,7 @@ def _refuse_unknown_for_all(
     sections: Mapping[str, Mapping[str, Any]], known: Mapping[str, Mapping[str, Parameter]]
 ) -> None:
     for name in sections.get("/**", {}):
-        if not _is_ros_own(name) and not any(name in parameters for parameters in known.values()):
+        if not is_ros_own(name) and not any(name in parameters for parameters in known.values()):
             raise ParameterError(f"section /**: no node has a parameter {name!r}")
 
 

@@ -23,6 +23,9 @@ METADATA_NAME = "agv_ncs"
 REPLAY_OF = "replay_of"
 """Key in it that names the recording, if the edge answered to that instead of an AGV."""
 
+NODES_NAME = "agv_ncs_nodes"
+"""Name of the record with what the loop's nodes said: the full name of each, and `params`, their parameters' values."""
+
 _WINDOW = 1024
 """Messages that are held back to be ordered."""
 
@@ -97,6 +100,10 @@ class BagWriter:
         if len(self._pending) >= self._room:
             self._write_all_but(self._window)
             self._room = self._window + self._batch
+
+    def add_metadata(self, name: str, content: dict[str, str]) -> None:
+        """Add a metadata record, after the messages that have been written so far."""
+        self._writer.add_metadata(name, content)
 
     def close(self) -> None:
         """Write what is held back, the index and metadata.yaml."""

@@ -9,8 +9,12 @@ from numpy.typing import NDArray
 
 from agv_analysis.recordings.messages_on_steps import NOTHING, OnSteps, Steps, stamps_of
 from agv_analysis.recordings.slot_outcomes import reasons
+from agv_ros.errors import UserError
 from agv_ros.messages import DELAYED, DELIVERED
-from agv_ros.stamps import Grid
+from agv_ros.stamps import NS_PER_S, Grid
+
+_FEWEST_STAMPS = 4
+"""Fewer do not tell a sampling period."""
 
 
 def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
@@ -55,3 +59,35 @@ def _passed_on(slots: OnSteps, last: int) -> Steps:
 
 def _where(messages: OnSteps, condition: Callable[[NDArray[np.void]], NDArray[np.bool_]]) -> Steps:
     return messages.k[condition(messages.messages)]
+
+
+def refuse_other_grid(on_steps: Mapping[str, OnSteps], stamps: Mapping[str, Steps], grid: Grid, source: str) -> None:
+    """Raise UserError if poses and slots were not recorded with the sampling period of `grid`.
+
+    `stamps` [ns] are those of all messages by topic, in any order. One message lost now and then leaves most pairs of
+    neighbours a period apart; another period does not.
+    """
+    apart = {_usual_spacing(stamps[topic]) for topic in ("agv/pose", "edge/slot")}
+    if len(apart) == 1 and (found := apart.pop()) not in (None, grid.ts_ns):
+        raise UserError(
+            f"{source}: plant.ts is {grid.ts_ns / NS_PER_S:g} s in the parameters, but poses and slots are recorded "
+            f"every {found / NS_PER_S:g} s: name the params file of this run with --config"
+        )
+    for topic in ("agv/pose", "edge/slot"):
+        off, count = on_steps[topic].off_grid, len(stamps[topic])
+        if off > count / 2:
+            raise UserError(
+                f"{source}: {off} of {count} messages of {topic} are not on the grid of plant.start_time + k * "
+                f"plant.ts = {grid.start_ns / NS_PER_S:g} s + k * {grid.ts_ns / NS_PER_S:g} s: name the params file of "
+                "this run with --config"
+            )
+
+
+def _usual_spacing(stamps: Steps) -> int | None:
+    """Distance [ns] of more than half of the neighbouring stamps; None if there is no such distance."""
+    if len(stamps) < _FEWEST_STAMPS:
+        return None
+    spacings, counts = np.unique(np.diff(np.unique(stamps)), return_counts=True)
+    if not len(counts) or 2 * counts.max() <= counts.sum():
+        return None
+    return int(spacings[np.argmax(counts)])

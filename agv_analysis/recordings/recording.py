@@ -11,7 +11,7 @@ import numpy as np
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.bags.writer import METADATA_NAME
 from agv_analysis.recordings import notes, restarts
-from agv_analysis.recordings.completeness import unexplained
+from agv_analysis.recordings.completeness import refuse_other_grid, unexplained
 from agv_analysis.recordings.messages_on_steps import (
     NOTHING,
     OnSteps,
@@ -21,6 +21,7 @@ from agv_analysis.recordings.messages_on_steps import (
     on_steps,
     postures,
     speeds_of_errors,
+    stamps_of,
 )
 from agv_analysis.recordings.slot_outcomes import slot_outcomes
 from agv_analysis.run import Floats, Run
@@ -86,6 +87,8 @@ def _scenario(bag: Bag, path: Path, config: Path | None) -> Scenario:
 
 def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Run:
     topics = {topic: on_steps(bag[name], scenario.grid) for topic, name in names.items()}
+    stamps = {topic: stamps_of(bag[names[topic]]) for topic in ("agv/pose", "edge/slot")}
+    refuse_other_grid(topics, stamps, scenario.grid, source)
     poses, slots = topics["agv/pose"], topics["edge/slot"]
     k = np.intersect1d(poses.k, slots.k, assume_unique=True)
     if not len(k):

@@ -18,6 +18,8 @@ def colour_of(verdict: Verdict) -> str:
     """Colour of a verdict's word, in rich's markup."""
     return "green" if verdict.word in GREEN else "yellow" if verdict.word in _YELLOW else "red"
 
+_NOT_JUDGED = "not judged: messages are missing that no channel lost"
+
 
 def print_table(analysis: Observations) -> None:
     """Print the figures, then one line for each disagreement between the criteria, then the notes."""
@@ -31,13 +33,13 @@ def print_table(analysis: Observations) -> None:
     table.add_column()
     for name, value in rows(analysis):
         table.add_row(name, value)
-    console.print(table)
-    for sentence in analysis.disagreements():
-        console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     for topic, count in analysis.run.unexplained.items():
         console.print(
             f"[bold red]Invalid:[/] {count} messages of {escape(topic)} are missing, and no channel lost them."
         )
+    console.print(table)
+    for sentence in _disagreements(analysis):
+        console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     for note in analysis.run.notes:
         console.print(f"[dim]Note: {escape(note)}.[/]")
 
@@ -53,11 +55,12 @@ def print_side_by_side(analyses: Mapping[str, Observations]) -> None:
     found = [dict(rows(analysis)) for analysis in analyses.values()]
     for name in dict.fromkeys(name for figures in found for name in figures):
         table.add_row(f"[bold]{name}[/]", *(figures.get(name, "-") for figures in found))
-    console.print(table)
     for title, analysis in analyses.items():
         for topic, count in analysis.run.unexplained.items():
             console.print(f"[bold red]{title} is invalid:[/] {count} messages of {escape(topic)} are missing.")
-        for sentence in (*analysis.disagreements(), *analysis.run.notes):
+    console.print(table)
+    for title, analysis in analyses.items():
+        for sentence in (*_disagreements(analysis), *analysis.run.notes):
             console.print(f"[dim]{title}: {escape(sentence)}.[/]")
 
 
@@ -87,10 +90,17 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     yield "Damping of the speed", found.damping or "the run cannot tell"
     yield "Error", f"at most {found.position.peak:.3g} m, {found.position.final:.3g} m at the end"
     yield "Fitted channel", _fit(analysis)
-    if isinstance(analysis, Analysis):
+    if run.unexplained:
+        yield "Stability", _NOT_JUDGED
+    elif isinstance(analysis, Analysis):
         yield from _criteria(analysis)
     else:
         yield "Stability", f"not judged: {GAINS_UNKNOWN}"
+
+
+def _disagreements(analysis: Observations) -> list[str]:
+    """Sentences on criteria that disagree; none of a recording that proves nothing."""
+    return [] if analysis.run.unexplained else analysis.disagreements()
 
 
 def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:

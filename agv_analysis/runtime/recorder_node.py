@@ -11,6 +11,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.duration import Duration, Infinite
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -20,7 +21,8 @@ from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_analysis.bags.message_definitions import schema_of
-from agv_analysis.bags.writer import BagWriter, TopicInfo
+from agv_analysis.bags.writer import NODES_NAME, BagWriter, TopicInfo
+from agv_analysis.runtime.parameter_client_node import ParameterClient
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
 from agv_analysis.version import version
@@ -28,6 +30,7 @@ from agv_ros.codec import stamp_of
 from agv_ros.executor import run_node
 from agv_ros.messages import PUBLISHED
 from agv_ros.node import ENDED, LoopNode
+from agv_ros.ros_yaml import dump
 
 TOPICS: dict[str, type] = {
     "/clock": Clock,
@@ -45,11 +48,17 @@ TOPICS: dict[str, type] = {
     "agv/plan": MultiDOFJointTrajectory,
     "agv/slot": TimeReference,
     "/diagnostics": DiagnosticArray,
+    "/parameter_events": ParameterEvent,
 }
 """What is recorded. The loop's names are relative: a recorder records the loop of its own namespace."""
 
 _DIAGNOSTICS = list(TOPICS).index("/diagnostics")
 """Its number; a fleet's recorders know it under other names."""
+
+_PARAMETER_EVENTS = list(TOPICS).index("/parameter_events")
+
+PUBLISHERS = {"plant": "agv/pose", "relay": "edge/slot", "error_detector": "edge/error", "controller": "edge/cmd_vel"}
+"""The topic by which each node of the loop is known, whatever it is called."""
 
 
 class RecorderNode(LoopNode[RecorderParameters]):
@@ -67,7 +76,9 @@ class RecorderNode(LoopNode[RecorderParameters]):
         agv, edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
         everywhere = [agv] if edge is agv else [agv, edge]
         one = {topic: [edge] if topic.startswith("edge/") else [agv] for topic in TOPICS}
-        sides = [*(one | {"/diagnostics": everywhere}).values()]
+        sides = [*(one | {"/diagnostics": everywhere, "/parameter_events": everywhere}).values()]
+        self._parameters_of = {node: ParameterClient(one[topic][0], topic) for node, topic in self.asked().items()}
+        self._newest_ns = 0
         self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
         describe = [
             self._describer(topic, kind, where)
@@ -80,6 +91,11 @@ class RecorderNode(LoopNode[RecorderParameters]):
         for number, (topic, kind) in enumerate(TOPICS.items()):
             for side in sides[number]:
                 self.input(kind, topic, self._receiver(number), on=side)
+        self.poll(self._ask)
+
+    def asked(self) -> dict[str, str]:
+        """Nodes whose parameters are asked for, each with a topic that it publishes."""
+        return PUBLISHERS
 
     def about(self) -> dict[str, str]:
         """What is embedded in the bag. Raises UserError."""
@@ -89,14 +105,19 @@ class RecorderNode(LoopNode[RecorderParameters]):
         write, now_ns = self._writer.write, self._now_ns
 
         def record(data: bytes) -> None:
-            stamp_ns = max(0, stamp_of(data))  # MCAP knows no time before 0
+            stamp_ns = self._newest_ns = max(0, stamp_of(data))  # MCAP knows no time before 0
             write(number, data, now_ns(stamp_ns), stamp_ns)
 
         def record_diagnostics(data: bytes) -> None:
             record(data)
             self._note(deserialize_message(data, DiagnosticArray))
 
-        return record_diagnostics if number == _DIAGNOSTICS else record
+        def record_change(data: bytes) -> None:
+            if self._is_change(deserialize_message(data, ParameterEvent)):
+                # It has the time of a clock that is not the loop's, which would put it behind all that follows.
+                write(number, data, now_ns(self._newest_ns), self._newest_ns)
+
+        return {_DIAGNOSTICS: record_diagnostics, _PARAMETER_EVENTS: record_change}.get(number, record)
 
     def _describer(self, topic: str, kind: type, sides: Sequence[Node]) -> Callable[[], TopicInfo]:
         module = kind.__module__.split(".")
@@ -108,9 +129,30 @@ class RecorderNode(LoopNode[RecorderParameters]):
             offered = [_qos(info.qos_profile) for info in publishers]
             distinct = [qos for i, qos in enumerate(offered) if qos not in offered[:i]]
             type_hash = str(publishers[0].topic_type_hash) if publishers else ""
+            if topic == self._names[_PARAMETER_EVENTS] and not self._writer.counts[_PARAMETER_EVENTS]:
+                distinct = []  # every node publishes it, so it would be in every bag, without any message
             return TopicInfo(topic, type_name, schema, type_hash, distinct)
 
         return describe
+
+    # -- parameters of the nodes -------------------------------------------------------------------------------------
+
+    def _ask(self) -> bool:
+        """Ask the nodes that have appeared; has each said its parameters?"""
+        answered = [client.ask() for client in self._parameters_of.values()]
+        return all(answered)
+
+    def _is_change(self, event: ParameterEvent) -> bool:
+        """Did a node of the loop change a parameter? What it declared at its start, it says when it is asked."""
+        return bool(event.changed_parameters) and any(
+            client.name == event.node for client in self._parameters_of.values()
+        )
+
+    def _said(self) -> dict[str, str]:
+        """What the nodes said of their parameters, as a params file, and what they are called."""
+        answered = {node: client for node, client in self._parameters_of.items() if client.values is not None}
+        params = {node: {"ros__parameters": client.values} for node, client in answered.items()}
+        return {"params": dump(params), **{node: client.name for node, client in answered.items()}}
 
     # -- completeness ------------------------------------------------------------------------------------------------
 
@@ -142,12 +184,15 @@ class RecorderNode(LoopNode[RecorderParameters]):
 
     def has_all_of(self, nodes: int) -> bool:
         """Is everything here, after this number of nodes has ended? Before, messages may still be on their way."""
-        return len(self._published) >= nodes and self.is_settled()
+        is_said = not any(client.is_waiting for client in self._parameters_of.values())
+        return len(self._published) >= nodes and self.is_settled() and is_said
 
     def close(self) -> None:
         """Finish the bag and say what is in it."""
         missing = self.missing()
         try:
+            if any(client.values is not None for client in self._parameters_of.values()):
+                self._writer.add_metadata(NODES_NAME, self._said())
             self._writer.close()
         except OSError as error:
             self.failure = f"{self.settings.bag}: cannot be written: {error.strerror}"

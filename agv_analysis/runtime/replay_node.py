@@ -15,7 +15,7 @@ from sensor_msgs.msg import TimeReference
 
 from agv_analysis.bags.writer import REPLAY_OF
 from agv_analysis.runtime.edge_inputs import EdgeInputs, SlotInput
-from agv_analysis.runtime.recorder_node import TOPICS, RecorderNode
+from agv_analysis.runtime.recorder_node import PUBLISHERS, TOPICS, RecorderNode
 from agv_ros.codec import decode_command, decode_error, encode_clock
 from agv_ros.messages import Command, TrackingError
 from agv_ros.node import LOOP_QOS, LoopNode
@@ -64,6 +64,10 @@ class ReplayRecorder(RecorderNode):
         self._record = {topic: self._receiver(number) for number, topic in enumerate(TOPICS)}
         self._number = {topic: number for number, topic in enumerate(TOPICS)}
         self.player: ReplayNode | None = None
+
+    def asked(self) -> dict[str, str]:
+        """The edge's nodes: there are no others in a replay."""
+        return {node: PUBLISHERS[node] for node in ("error_detector", "controller")}
 
     def about(self) -> dict[str, str]:
         """What is embedded in the bag."""
