@@ -17,6 +17,9 @@ LOST = "lost"
 DELAYED = "delayed"
 """What a slot says of its message; a delayed one comes in a later slot."""
 
+CHANGED = "changed "
+"""Key, before a parameter's name, under which a node's diagnostics say how it was changed last while the node ran."""
+
 PUBLISHED = "published "
 """Key, before the topic's name, under which a node's diagnostics say how many messages it has published there."""
 

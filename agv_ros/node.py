@@ -30,7 +30,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from agv_ros.codec import encode_diagnostics, stamp_of
 from agv_ros.errors import UserError
-from agv_ros.messages import PUBLISHED, InvalidMessageError
+from agv_ros.messages import CHANGED, PUBLISHED, InvalidMessageError
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid, to_nanoseconds
 
@@ -42,10 +42,6 @@ LOOP_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
-
-
-CHANGED = "changed "
-"""Key, before a parameter's name, under which a node's diagnostics say how it was changed last while the node ran."""
 
 ENDED = "ended"
 """Key in a node's last diagnostics: its counts of messages there are final."""

@@ -23,6 +23,7 @@ from agv_analysis.recordings.messages_on_steps import (
     speeds_of_errors,
     stamps_of,
 )
+from agv_analysis.recordings.node_parameters import EVENTS, Said, said_by_nodes
 from agv_analysis.recordings.slot_outcomes import slot_outcomes
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
@@ -43,7 +44,8 @@ _NO_TRUTH = "the AGV measures its pose with noise, and agv/ground_truth is not i
 def read_run(path: Path, config: Path | None = None, namespace: str | None = None) -> Run:
     """Run of the loop that is recorded in a rosbag2 directory or an MCAP file.
 
-    Parameters come from `config`, a params file, or from the bag itself. `namespace` chooses one of several loops.
+    Parameters come from `config`, a params file, or from the bag itself; what the nodes said in the recording counts
+    more than either, and notes tell where it differs. `namespace` chooses one of several loops.
     Raises UserError if the bag cannot be read, holds no loop, or if its parameters are not known.
     """
     bag = read_bag(path, topics=())
@@ -52,11 +54,12 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     namespace = names["agv/pose"].removesuffix("agv/pose")
     own = f"{namespace}diagnostics"  # of a vehicle of a fleet
     diagnostics = own if own in bag.topics else restarts.TOPIC
-    bag = read_bag(path, topics=(*names.values(), diagnostics))
-    run = _run(bag, names, scenario, str(path))
+    bag = read_bag(path, topics=(*names.values(), diagnostics, EVENTS))
+    said = said_by_nodes(bag, names, diagnostics, scenario, str(config or "the parameters in the bag"))
+    run = _run(bag, names, said, str(path))
     if diagnostics not in bag.topics:
         return run
-    again = restarts.restarts(bag[diagnostics], namespace, scenario.grid)
+    again = restarts.restarts(bag[diagnostics], namespace, run.scenario.grid)
     return dataclasses.replace(run, notes=(*run.notes, *again))
 
 
@@ -85,7 +88,8 @@ def _scenario(bag: Bag, path: Path, config: Path | None) -> Scenario:
     return parse_scenario(embedded, f"parameters in {path}")
 
 
-def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Run:
+def _run(bag: Bag, names: dict[str, str], said: Said, source: str) -> Run:
+    scenario = said.scenario
     topics = {topic: on_steps(bag[name], scenario.grid) for topic, name in names.items()}
     stamps = {topic: stamps_of(bag[names[topic]]) for topic in ("agv/pose", "edge/slot")}
     refuse_other_grid(topics, stamps, scenario.grid, source)
@@ -125,11 +129,12 @@ def _run(bag: Bag, names: dict[str, str], scenario: Scenario, source: str) -> Ru
         downlink=of_downlink,
         source=source,
         unexplained=unexplained(topics, scenario.grid),
+        parameter_changes=said.changes,
     )
     unknown = () if is_true_known or not scenario.plant.is_noisy else (_NO_TRUTH,)
     of_run = (*notes.of_replay(bag), *notes.of_first_step(run))
     of_content = (*notes.of_messages(topics, names), *notes.of_mismatch(run), *notes.of_commands(run))
-    return dataclasses.replace(run, notes=(*bag.problems, *of_run, *of_content, *unknown))
+    return dataclasses.replace(run, notes=(*bag.problems, *said.notes, *of_run, *of_content, *unknown))
 
 
 def _reference(topics: Mapping[str, OnSteps], k: Steps, scenario: Scenario, source: str) -> Floats:
