@@ -91,8 +91,13 @@ class DrivenCommands:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; an infinite size is null."""
-        plain = asdict(self) | {"pieces": [piece._asdict() for piece in self.pieces], "differs": self.differs}
-        return {name: None if value == np.inf else value for name, value in plain.items()}
+        plain = asdict(self) | {"differs": self.differs}
+        plain["pieces"] = [piece._asdict() | {"driven": _without_inf(piece.driven)} for piece in self.pieces]
+        return _without_inf(plain)
+
+
+def _without_inf(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: None if value == np.inf else value for name, value in values.items()}
 
 
 def driven_commands(run: Run) -> DrivenCommands:
@@ -103,7 +108,7 @@ def driven_commands(run: Run) -> DrivenCommands:
     if not usable.any():
         return DrivenCommands(0, None, 0.0, 0.0, 0.0, (), "", cannot_say)
     speeds = speeds_with_errors(run)
-    sizes = sizes_of(_computed(run, speeds) - run.command)[usable]
+    sizes = sizes_of(_computed(run, speeds)[usable] - run.command[usable])
     k, wrong = run.k[usable], differs(sizes, run.command[usable])
     if not wrong.any():
         return DrivenCommands(len(k), None, 0.0, float(sizes.max()), 0.0, (), "", cannot_say)
@@ -198,7 +203,8 @@ def _computed(run: Run, speeds: Floats) -> Floats:
             near = slice(max(0, row - _AROUND_CHANGE), row + _AROUND_CHANGE)
             for scenario in (before, after):
                 other, _ = answers_to_errors(run.error[near], speeds[near], (), settings_of(scenario), scenario)
-                nearer = sizes_of(other - run.command[near]) < sizes_of(computed[near] - run.command[near])
+                with np.errstate(invalid="ignore"):  # a command that is not finite is not compared
+                    nearer = sizes_of(other - run.command[near]) < sizes_of(computed[near] - run.command[near])
                 computed[near][nearer] = other[nearer]
     return computed
 

@@ -218,3 +218,27 @@ def test_parameters_of_another_run_are_noticed(tmp_path: Path) -> None:
     config.write_text(load_scenario(str(REPOSITORY / "config/paper.yaml"), ["plant.start_time=1.001"]).to_yaml())
     with pytest.raises(UserError, match="not on the grid"):
         read_run(SAMPLE, config)
+
+
+@pytest.mark.parametrize("ts", [0.02, 0.01, 0.004, 0.0025, 0.0049])
+def test_another_sampling_period_is_refused(tmp_path: Path, ts: float) -> None:
+    config = tmp_path / "other.yaml"
+    config.write_text(load_scenario(str(REPOSITORY / "config/outages.yaml"), [f"plant.ts={ts}"]).to_yaml())
+    with pytest.raises(UserError) as refused:
+        read_run(SAMPLE, config)
+    assert str(refused.value) == (
+        f"{SAMPLE}: plant.ts is {ts} s in the parameters, but poses and slots are recorded every 0.005 s: name the "
+        "params file of this run with --config"
+    )
+
+
+def test_a_recording_of_every_fourth_step_is_refused(tmp_path: Path) -> None:
+    """All its stamps are on the grid of 5 ms, and a run of 20 ms it is."""
+    with pytest.raises(UserError, match=r"plant.ts is 0.005 s in the parameters, but .* are recorded every 0.02 s"):
+        read_run(changed_bag(tmp_path / "bag.mcap", lambda _, k, data: [data] if k % 4 == 0 else []))
+
+
+def test_a_recording_that_lost_many_messages_has_the_sampling_period_that_it_had(tmp_path: Path) -> None:
+    lost = set(np.random.default_rng(1).choice(2000, 600, replace=False).tolist())
+    run = read_run(changed_bag(tmp_path / "bag.mcap", lambda _, k, data: [] if k in lost else [data]))
+    assert run.unexplained["agv/pose"] > 500

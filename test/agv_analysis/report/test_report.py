@@ -21,6 +21,7 @@ from agv_analysis.report.matplotlib_figures import draw_figures
 from agv_analysis.report.page import render, write_report
 from agv_analysis.report.panels import LINE, Line, panels, thinned, track
 from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
+from agv_analysis.report.table import print_side_by_side, print_table
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
@@ -496,3 +497,21 @@ def test_a_folder_that_cannot_be_written_to_is_named(lap: Analysis, tmp_path: Pa
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="file: cannot be written to"):
         draw_figures(panels(lap), tmp_path / "file")
+
+
+def test_a_recording_that_proves_nothing_says_so_first_and_judges_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    run = simulate(scenario_of("plant.duration=2.0"))
+    judged = re.compile(r"stable|asymptotic|mean-square|bounded|Verdict|Margin|They disagree", re.IGNORECASE)
+    print_table(analyse(run))
+    print_side_by_side({"one": analyse(run)})
+    assert judged.search(capsys.readouterr().out)
+    damaged = analyse(dataclasses.replace(run, unexplained={"agv/pose": 3}))
+    print_table(damaged)
+    said = capsys.readouterr().out
+    assert said.startswith("Invalid: 3 messages of agv/pose are missing, and no channel lost them.\n")
+    assert "not judged: messages are missing that no channel lost" in said
+    assert not judged.search(said)
+    print_side_by_side({"one": damaged})
+    said = capsys.readouterr().out
+    assert said.startswith("one is invalid: 3 messages of agv/pose are missing.\n")
+    assert not judged.search(said)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.driven_commands import driven_commands
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 
@@ -155,3 +156,7 @@ def agree(recorded: Run) -> None:
     np.testing.assert_allclose(recorded.error[:, :2], simulated.error[:, :2], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(np.sin(recorded.error[:, 2] - simulated.error[:, 2]), 0.0, atol=1e-9)
     np.testing.assert_allclose(recorded.command, simulated.command, rtol=0.0, atol=1e-9)
+    driven = driven_commands(recorded)
+    assert (driven.sentence, driven.cannot_say, recorded.parameter_changes) == ("", "", ())
+    assert driven.compared >= len(recorded) - 1
+    assert not [note for note in recorded.notes if "the node said" in note or "do not fit" in note]
