@@ -42,6 +42,46 @@ class ParameterChange:
 
 
 @dataclass(frozen=True)
+class Timing:
+    """When the messages of a run in real time came, from their log times, and what its nodes say of their deadlines."""
+
+    is_late: bool
+    """Were poses or commands that acted older than losses explain, by more than jitter? See docs/bags.md."""
+    command_age: NDArray[np.int64]
+    """Steps since the pose behind the command that acted at step k, by stamps or by receive time, whichever is more;
+    shape (N,)."""
+    late_poses: int = 0
+    """Poses that came one sampling period or more too late."""
+    late_commands: int = 0
+    """Commands that came after the step that they were for had ended."""
+    deadlines: int | None = None
+    """Steps that the plant had to take in time; None if its diagnostics are not recorded, as are the next ones."""
+    missed_deadlines: int | None = None
+    longest_overdue: float | None = None
+    """Most by which a tick of the plant was later after the one before it than T_s [s]."""
+    missed_edge_steps: int | None = None
+    """Steps that an edge with its own clock did not take."""
+    unknown: str = ""
+    """Why log times do not say when messages came; empty if they do."""
+    sentences: tuple[str, ...] = ()
+    """All of this in words, as it is in the notes of the run."""
+
+    def to_json(self) -> dict[str, int | float | bool | str | None]:
+        """The figures by name; SI units."""
+        return {
+            "late": None if self.unknown else self.is_late,
+            "command_age_max": int(self.command_age.max()),
+            "late_poses": None if self.unknown else self.late_poses,
+            "late_commands": None if self.unknown else self.late_commands,
+            "deadlines": self.deadlines,
+            "missed_deadlines": self.missed_deadlines,
+            "longest_overdue": self.longest_overdue,
+            "missed_edge_steps": self.missed_edge_steps,
+            "unknown_because": self.unknown or None,
+        }
+
+
+@dataclass(frozen=True)
 class Run:
     """A run of N steps, row i of every array belonging to step k[i]; SI units, frame `map` unless said otherwise."""
 
@@ -83,11 +123,32 @@ class Run:
     """Are the gains and limits in `scenario.controller` those of the run? Else they mean nothing."""
     seed_known: bool = True
     """Were the losses drawn from `scenario.relay.seed`? Those of a real radio come from none."""
+    n_ul_received: NDArray[np.int64] | None = None
+    """Steps since the freshest pose that had come to the edge when step k ended, shape (N,); None if log times do not
+    say it, as of a run in lockstep."""
+    n_dl_received: NDArray[np.int64] | None = None
+    """Steps since the freshest command that had come to the AGV was sent, likewise; of another robot the steps by which
+    the command that had come is behind the newest that was sent."""
+    timing: Timing | None = None
+    """None for a simulated run and one in lockstep, which have no timing of their own."""
 
     @property
     def sent_pose(self) -> Floats:
         """What the AGV sent of its pose, shape (N, 3): all that the edge can know."""
         return self.pose if self.measured is None else self.measured
+
+    @property
+    def command_age(self) -> NDArray[np.int64]:
+        """Steps since the pose behind the command that acted at step k, shape (N,): what to judge a run by.
+
+        It is `n_ul`, but where the timing of a run was not what its slots say.
+        """
+        return self.n_ul if self.timing is None or not self.timing.is_late else self.timing.command_age
+
+    @property
+    def is_late(self) -> bool:
+        """Were poses or commands older than the slots say, by receive time?"""
+        return self.timing is not None and self.timing.is_late
 
     @property
     def ts(self) -> float:

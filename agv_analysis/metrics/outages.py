@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ class LinkOutages:
     """Length of the outage that was still open when the run ended, 0 if there was none."""
     age: Age
     """Steps since the freshest message that the receiver holds was sent: 0 at a reception."""
+    age_received: Age | None = None
+    """The same by receive time, where the timing of the run was not what its slots say."""
 
     @property
     def loss_rate(self) -> float:
@@ -73,6 +75,8 @@ class Outages:
     """The poses on their way to the edge; its age is n_ul."""
     downlink: LinkOutages
     """The commands on their way to the AGV."""
+    command_age: Age | None = None
+    """Age of the pose behind the command that acted, where the timing of the run was not what its slots say."""
 
     @property
     def loss_rate(self) -> float:
@@ -81,23 +85,37 @@ class Outages:
 
     @property
     def n_ul_max(self) -> int:
-        """Largest number of steps since the freshest pose that the edge held."""
+        """Largest number of steps since the freshest pose that the edge held, by the slots."""
         return self.uplink.age.max
+
+    @property
+    def n_max(self) -> int:
+        """The same of the pose behind the command that acted, by receive time where that is more."""
+        return max(self.n_ul_max, 0 if self.command_age is None else self.command_age.max)
 
 
 def outages(run: Run) -> Outages:
     """Outages of a run. Raises UserError if the run has no step.
 
-    The ages are those that the slots say; that of the downlink follows from its outcomes where it is not recorded.
+    The ages are those that the slots say, beside them those by receive time where the run's timing was another; that of
+    the downlink follows from its outcomes where it is not recorded.
     Where steps are missing from a recording an outage ends, since the outcomes of those slots are unknown.
     """
     if not len(run):
         raise UserError(f"{run.source}: no step of the loop in it, so no outage: record at least one")
     n_dl = ages(run.k, run.downlink_lost) if run.n_dl is None else run.n_dl
     return Outages(
-        uplink=link_outages(run.k, run.lost, run.n_ul, run.ts),
-        downlink=link_outages(run.k, run.downlink_lost, n_dl, run.ts),
+        uplink=_as_received(link_outages(run.k, run.lost, run.n_ul, run.ts), run.n_ul_received, run),
+        downlink=_as_received(link_outages(run.k, run.downlink_lost, n_dl, run.ts), run.n_dl_received, run),
+        command_age=age_statistics(run.command_age, run.ts) if run.is_late else None,
     )
+
+
+def _as_received(link: LinkOutages, age: Steps | None, run: Run) -> LinkOutages:
+    """With the ages by receive time, if the run has them and they are not what the slots say."""
+    if age is None or not run.is_late:
+        return link
+    return replace(link, age_received=age_statistics(age, run.ts))
 
 
 def loss_causes(link: LinkSlots | None) -> dict[str, int]:

@@ -2,7 +2,7 @@
 
 Such a bag has no slots that say what the radio lost. What is known comes from the stamps of the poses: their median
 distance, where none is missing, is a period, a gap of m periods stands for m - 1 lost poses, and the whole time divided
-by all periods is T_s. So the bag should be recorded where the controller runs.
+by all periods is T_s. When they came, their log times say. So the bag should be recorded where the controller runs.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from agv_analysis.metrics.outages import ages
 from agv_analysis.recordings.posture_track import Track, read_poses
 from agv_analysis.recordings.robot_commands import read_commands
 from agv_analysis.recordings.robot_reference import read_reference
+from agv_analysis.recordings.robot_timing import with_timing
 from agv_analysis.recordings.robot_topics import RobotTopics
 from agv_analysis.recordings.sampling import sampling_notes, sampling_of
 from agv_analysis.run import Run
@@ -67,7 +68,7 @@ def _run(
     fitted = _fitted(scenario, sampling.period, came, has_track_start=config is not None)
     reference = Reference(fitted.error_detector).first(len(k)) if target is None else target.at(stamps)
     command, command_notes = read_commands(bag, topics.command, came, stamps, sampling.period)
-    return Run(
+    run = Run(
         scenario=fitted,
         k=k,
         pose=pose,
@@ -88,6 +89,7 @@ def _run(
         gains_known=config is not None,
         seed_known=False,
     )
+    return with_timing(run, bag, topics.command, came, sampling.k)
 
 
 def _fitted(scenario: Scenario, period: float, came: Track, has_track_start: bool) -> Scenario:

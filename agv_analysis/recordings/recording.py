@@ -12,6 +12,7 @@ from agv_analysis.bags import Bag, read_bag
 from agv_analysis.bags.writer import METADATA_NAME
 from agv_analysis.recordings import notes, restarts
 from agv_analysis.recordings.completeness import refuse_other_grid, unexplained
+from agv_analysis.recordings.loop_timing import with_timing
 from agv_analysis.recordings.messages_on_steps import (
     NOTHING,
     OnSteps,
@@ -57,10 +58,11 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     bag = read_bag(path, topics=(*names.values(), diagnostics, EVENTS))
     said = said_by_nodes(bag, names, diagnostics, scenario, str(config or "the parameters in the bag"))
     run = _run(bag, names, said, str(path))
-    if diagnostics not in bag.topics:
-        return run
-    again = restarts.restarts(bag[diagnostics], namespace, run.scenario.grid)
-    return dataclasses.replace(run, notes=(*run.notes, *again))
+    reports = bag[diagnostics] if diagnostics in bag.topics else None
+    if reports is not None:
+        again = restarts.restarts(reports, namespace, run.scenario.grid)
+        run = dataclasses.replace(run, notes=(*run.notes, *again))
+    return with_timing(run, bag, names, reports, namespace)
 
 
 def loop_topics(bag: Bag, path: Path, namespace: str | None) -> dict[str, str]:

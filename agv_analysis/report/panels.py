@@ -140,9 +140,13 @@ def speed(run: Run) -> Panel:
 
 def age(run: Run) -> Panel:
     """Age of the freshest pose that the edge holds."""
-    line = Line("n_ul", run.time, run.n_ul.astype(np.float64), LOST, STEP)
+    lines = [Line("n_ul", run.time, run.n_ul.astype(np.float64), LOST, STEP)]
+    if run.is_late:
+        acted = run.command_age.astype(np.float64)
+        lines.append(Line("by receive time, of the command that acted", run.time, acted, DRIVEN, STEP))
     label = f"n_ul [{run.ts * 1e3:g} ms]"
-    return Panel("age", "Age of information: steps since the freshest pose that the edge holds", TIME, label, (line,))
+    title = "Age of information: steps since the freshest pose that the edge holds"
+    return Panel("age", title, TIME, label, tuple(lines))
 
 
 def _limit(name: str, run: Run, value: float) -> Line:

@@ -18,6 +18,7 @@ def colour_of(verdict: Verdict) -> str:
     """Colour of a verdict's word, in rich's markup."""
     return "green" if verdict.word in GREEN else "yellow" if verdict.word in _YELLOW else "red"
 
+
 _NOT_JUDGED = "not judged: messages are missing that no channel lost"
 
 
@@ -78,6 +79,13 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
         "Age of information",
         (f"n_ul: mean {up.age.mean:.2f}, p99 {up.age.p99}, at most {up.age.max} steps ({up.age.max * ms:g} ms)"),
     )
+    acted = analysis.outages.command_age
+    if acted is not None:
+        yield (
+            "Age by receive time",
+            f"of the pose behind the command that acted: mean {acted.mean:.2f}, p99 {acted.p99}, at most {acted.max} "
+            f"steps ({acted.max * run.ts:g} s)",
+        )
     down = analysis.outages.downlink
     if down.lost or down.age.max:
         yield (

@@ -42,8 +42,8 @@ class Observations:
 
     @property
     def n(self) -> int:
-        """The outdatedness that the stability criteria are asked about: the largest n_ul of the run."""
-        return self.outages.n_ul_max
+        """The outdatedness that the stability criteria are asked about: the largest age of a pose that acted."""
+        return self.outages.n_max
 
     def disagreements(self) -> list[str]:
         """None: without gains there are no criteria that could disagree."""
@@ -61,11 +61,12 @@ class Observations:
             "unexplained": dict(run.unexplained),
             "notes": list(run.notes),
             "loss_rate": up.loss_rate,
-            "n_ul_max": self.n,
+            "n_ul_max": self.outages.n_ul_max,
             "n_ul_mean": up.age.mean,
             "n_ul_p99": up.age.p99,
             "mean_burst": up.mean_burst,
             "outage_lengths": {str(length): count for length, count in up.histogram.items()},
+            "timing": None if run.timing is None else run.timing.to_json(),
             "loss_causes": loss_causes(run.uplink),
             "downlink_loss_rate": down.loss_rate,
             "downlink_loss_causes": loss_causes(run.downlink),

@@ -54,13 +54,13 @@ class RunFacts:
 
     @property
     def n(self) -> int:
-        """Age of the oldest pose of the run [steps]."""
-        return self.outages.n_ul_max
+        """Age of the oldest pose behind a command that acted in the run [steps], by receive time if that is known."""
+        return self.outages.n_max
 
     @property
     def is_late(self) -> bool:
-        """Did messages arrive in a later slot than their own?"""
-        return has_late(self.run.uplink) or has_late(self.run.downlink)
+        """Did messages arrive in a later slot than their own, by what the slots say or by when they came?"""
+        return has_late(self.run.uplink) or has_late(self.run.downlink) or self.run.is_late
 
     @cached_property
     def downlink_fit(self) -> ChannelFit:

@@ -39,11 +39,23 @@ def _contractions(facts: RunFacts) -> tuple[float | None, float | None]:
 def _late_contraction(run: Run, loop: LinearLoop) -> float | None:
     """Growth factor per step about the reference from the first step on; None for what `variable_delay` cannot say."""
     is_whole = run.k[0] == 0 and int(run.k[-1]) + 1 == len(run)
-    if loop.predicts or not is_whole or has_late(run.downlink):
+    if loop.predicts or not is_whole or has_late(run.downlink) or not _held_its_command(run):
         return None
     with np.errstate(all="ignore"):
-        growth = variable_delay.age_sequence(loop, run.n_ul)
+        growth = variable_delay.age_sequence(loop, run.command_age)
     return finite(float(np.exp(growth / len(run))))
+
+
+def _held_its_command(run: Run) -> bool:
+    """Did the AGV act on the newest command that it had, however old? Then its age adds to that of the pose behind it.
+
+    Of another robot that is taken for granted.
+    """
+    plant = run.scenario.plant
+    if run.n_dl_received is None or not run.is_late or not run.seed_known:
+        return True
+    oldest = int(run.n_dl_received.max())
+    return oldest == 0 or (plant.downlink_policy == "hold" and oldest * run.ts <= plant.cmd_vel_timeout)
 
 
 CRITERION = Criterion(

@@ -1,0 +1,255 @@
+"""Whether a recorded run in real time kept the time that its stamps say: late poses, late commands, missed deadlines.
+
+A run in lockstep has no timing: its steps take what they take, and nothing is said of it. In real time the plant takes
+step k when it publishes the pose of step k + 1; which poses and commands had come by then, the log times say. That is
+exact if the recorder hears `edge/*` at the edge and `agv/*` at the AGV without delay, as beside a relay it does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.bags import Bag
+from agv_analysis.bags.layout import LOG_TIME
+from agv_analysis.bags.writer import METADATA_NAME, REPLAY_OF
+from agv_analysis.metrics.outages import ages
+from agv_analysis.recordings.messages_on_steps import NOTHING, OnSteps, Steps, on_steps, stamps_of
+from agv_analysis.recordings.node_reports import reports_of, total
+from agv_analysis.recordings.receive_times import (
+    MAX_RATE,
+    clock_line,
+    newest_at,
+    newest_held,
+    says_nothing,
+    usable_from,
+)
+from agv_analysis.run import Run, Timing
+from agv_ros.stamps import NS_PER_S, Grid
+
+START_UP = 0.1
+"""A run in real time may take this time [s] from its first step until its nodes keep pace."""
+
+RARE = 0.01
+"""A message that is late by less than two periods, in no more than this share of the steps, is jitter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Deadlines:
+    """What plant and edge say of a run in real time."""
+
+    steps: int
+    missed: int
+    longest_overdue: float
+    stops: int
+    ignored: int
+    missed_edge_steps: int | None
+
+
+def is_timed(bag: Bag, run: Run) -> bool:
+    """Had the run a timing: was it driven in real time, and is it no replay of another one?"""
+    is_replay = REPLAY_OF in bag.metadata.get(METADATA_NAME, {})
+    return run.scenario.plant.clock == "realtime" and not is_replay
+
+
+def with_timing(
+    run: Run, bag: Bag, names: Mapping[str, str], diagnostics: NDArray[np.void] | None, namespace: str
+) -> Run:
+    """The run with its timing, if it had one, and with what a reader must know of it in its notes.
+
+    `names`: the bag's name of each topic of the loop; `diagnostics`: None if they are not recorded.
+    """
+    if not is_timed(bag, run):
+        return run
+    said = None if diagnostics is None else deadlines_of(diagnostics, namespace, len(run))
+    topics = {topic: _as_received(bag[name], run.scenario.grid) for topic, name in names.items()}
+    poses = topics["agv/pose"]
+    stamps, logs = stamps_of(poses.messages), _logs(poses)
+    unknown = says_nothing(stamps, logs)
+    if not unknown and clock_line(stamps, logs).rate < -MAX_RATE:
+        unknown = "log times run slower than the stamps"
+    if unknown:
+        timing = Timing(False, run.n_ul, unknown=unknown)
+    else:
+        run = _as_received_at_edge_and_agv(run, topics, said)
+        assert run.timing is not None
+        timing = run.timing
+    if said is not None:
+        timing = dataclasses.replace(
+            timing, deadlines=said.steps, missed_deadlines=said.missed, longest_overdue=said.longest_overdue,
+            missed_edge_steps=said.missed_edge_steps,
+        )  # fmt: skip
+    timing = dataclasses.replace(timing, sentences=tuple(_sentences(run, timing, said)))
+    return dataclasses.replace(run, timing=timing, notes=(*run.notes, *timing.sentences))
+
+
+def deadlines_of(diagnostics: NDArray[np.void], namespace: str, steps: int) -> Deadlines | None:
+    """What the nodes of a namespace say; None if the plant says nothing of deadlines. `steps`: of the recording."""
+    plant = reports_of(diagnostics, f"{namespace}plant")
+    if "missed deadlines" not in plant:
+        return None
+    edge = reports_of(diagnostics, f"{namespace}error_detector")
+    return Deadlines(
+        steps=round(max(plant.get("step", [steps]))),
+        missed=total(plant["missed deadlines"]),
+        longest_overdue=max(plant.get("jitter max", [0.0])),
+        stops=total(plant.get("stops without command", [0.0])),
+        ignored=total(plant.get("outdated commands", [0.0])),
+        missed_edge_steps=total(edge["missed steps"]) if "missed steps" in edge else None,
+    )
+
+
+def _as_received(messages: NDArray[np.void], grid: Grid) -> OnSteps:
+    """The messages of a topic, of each step the one that came first."""
+    return on_steps(messages[np.argsort(messages[LOG_TIME], kind="stable")], grid)
+
+
+def _logs(messages: OnSteps) -> Steps:
+    return np.asarray(messages.messages[LOG_TIME], dtype=np.int64)
+
+
+def _as_received_at_edge_and_agv(run: Run, topics: Mapping[str, OnSteps], said: Deadlines | None) -> Run:
+    """The run with its timing and the ages by receive time, from log times."""
+    first, count = int(run.k[0]), int(run.k[-1] - run.k[0]) + 1
+    rows, steps = run.k - first, np.arange(count)
+    ends = _ends(run, topics["agv/pose"], first, count, said)
+    n_ul, n_dl = _dense(run.n_ul, rows), _dense(_stamped_downlink_age(run), rows)
+
+    poses = topics.get("edge/pose", NOTHING)
+    pose_steps, pose_logs = poses.k - first, _logs(poses) if len(poses.k) else poses.k
+    poses_usable = usable_from(pose_steps, pose_logs, ends)
+    held_pose = newest_held(pose_steps, poses_usable, count)
+
+    commands = topics["agv/cmd_vel"] if len(topics.get("agv/cmd_vel", NOTHING).k) else topics["edge/cmd_vel"]
+    taken = _not_ignored(commands, topics["agv/pose"], said)
+    command_steps, command_logs = commands.k[taken] - first, _logs(commands)[taken] if len(commands.k) else commands.k
+    commands_usable = usable_from(command_steps, command_logs, ends)
+    held_command = newest_held(command_steps, commands_usable, count)
+
+    behind = np.minimum(_pose_behind(topics, pose_steps, pose_logs, ends, first), steps - n_ul)
+    n_ul_received = np.where(held_pose >= 0, steps - held_pose, n_ul)
+    n_dl_received = np.where(held_command >= 0, steps - held_command, np.maximum(n_dl, steps))
+    by_receive_time = np.where(held_command >= 0, steps - behind[np.maximum(held_command, 0)], steps)
+    by_stamps = n_dl + n_ul[np.maximum(steps - n_dl, 0)]
+    acted = np.maximum(by_receive_time, by_stamps)[rows]
+    begun = rows > min(START_UP / run.ts, count / 10.0)
+    timing = Timing(
+        is_late=is_more_than_jitter((acted - _explained_by_losses(run, n_ul, rows))[begun]),
+        command_age=acted,
+        late_poses=int(np.count_nonzero(poses_usable > pose_steps)),
+        late_commands=int(np.count_nonzero(commands_usable > command_steps)),
+    )
+    return dataclasses.replace(run, timing=timing, n_ul_received=n_ul_received[rows], n_dl_received=n_dl_received[rows])
+
+
+def is_more_than_jitter(excess: NDArray[np.int64]) -> bool:
+    """Are ages older than they should be, by `excess` steps, by more than jitter of less than one period makes them?
+
+    One step too old, now and then, a message is that comes just before the end of its period or just after it.
+    """
+    return bool((excess >= 2).any()) or bool(np.count_nonzero(excess >= 1) > RARE * len(excess))
+
+
+def _ends(run: Run, poses: OnSteps, first: int, count: int, said: Deadlines | None) -> Steps:
+    """Log time at which the plant took each step: when it published the next pose, shape (count,).
+
+    No earlier than the clock says; and later only by as much as the plant itself was late at most, since beyond that it
+    was the recording that was.
+    """
+    grid, ts_ns = run.scenario.grid, run.scenario.grid.ts_ns
+    k = np.arange(first + 1, first + count + 1)
+    due = clock_line(stamps_of(poses.messages), _logs(poses)).log_times(grid.start_ns + k * ts_ns)
+    index, there = poses.at(k)
+    published = np.where(there, _logs(poses)[index], due)
+    leeway = ts_ns + (0 if said is None else round(said.longest_overdue * NS_PER_S))
+    return np.maximum.accumulate(np.clip(published, due, due + leeway))
+
+
+def _not_ignored(commands: OnSteps, poses: OnSteps, said: Deadlines | None) -> NDArray[np.bool_]:
+    """Which commands the plant took: if it says that it ignored some, not those that came before their own instant."""
+    if said is None or not said.ignored or not len(commands.k):
+        return np.ones(len(commands.k), dtype=np.bool_)
+    index, there = poses.at(commands.k)
+    return ~there | (_logs(commands) >= _logs(poses)[index])
+
+
+def _pose_behind(topics: Mapping[str, OnSteps], steps: Steps, logs: Steps, ends: Steps, first: int) -> Steps:
+    """Step of the freshest pose that the command of each step could use, shape (N,): had come when it was sent."""
+    own, sent = np.arange(len(ends)), ends.copy()
+    index, there = topics["edge/cmd_vel"].at(own + first)
+    if there.any():
+        sent[there] = np.maximum(sent[there], _logs(topics["edge/cmd_vel"])[index[there]])
+    newest = newest_at(steps, logs, sent)
+    return np.where(newest >= 0, np.minimum(newest, own), own)
+
+
+def _stamped_downlink_age(run: Run) -> Steps:
+    return ages(run.k, run.downlink_lost) if run.n_dl is None else run.n_dl
+
+
+def _dense(age: Steps, rows: Steps) -> Steps:
+    """Ages of all steps from the first one on, from those of the rows: between them they grow."""
+    steps = np.arange(int(rows[-1]) + 1)
+    row = np.searchsorted(rows, steps, side="right") - 1
+    return np.asarray(age[row] + steps - rows[row])
+
+
+def _explained_by_losses(run: Run, n_ul: Steps, rows: Steps) -> Steps:
+    """Ages of the poses behind the commands that acted, if nothing but losses made any of them older; shape (N,)."""
+    lost = _dense(ages(run.k, run.lost), rows)
+    received = np.flatnonzero(~run.lost)
+    before = rows[received[0]] if len(received) else len(n_ul)
+    explained = np.where(np.arange(len(n_ul)) < before, n_ul, lost)
+    late = ages(run.k, run.downlink_lost)
+    return np.asarray(late + explained[np.maximum(rows - late, 0)])
+
+
+def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str]:
+    """What a reader must know of the timing of a run in real time."""
+    if timing.unknown:
+        yield f"{timing.unknown}: when poses and commands came is not recorded, ages are those of the stamps"
+    if said is None:
+        yield "the plant's diagnostics are not in the recording: missed deadlines are not known"
+    elif said.missed:
+        yield (
+            f"{said.missed} of {said.steps} deadlines missed, the longest by {_ms(said.longest_overdue)}; the AGV held "
+            "its command"
+        )
+    if said is not None and said.stops:
+        yield f"the AGV stopped {said.stops} times because its newest command was older than plant.cmd_vel_timeout"
+    if said is not None and said.missed_edge_steps:
+        yield f"the edge missed {said.missed_edge_steps} of its steps"
+    if timing.is_late and run.n_ul_received is not None and run.n_dl_received is not None:
+        yield from late_sentences(run, timing)
+        if said is not None and said.ignored > RARE * said.steps:
+            yield f"the AGV ignored {said.ignored} commands, which came after a newer one or before their own instant"
+
+
+def late_sentences(run: Run, timing: Timing) -> Iterator[str]:
+    """How late poses and commands were; `run` has the ages by receive time of at least one of them."""
+    if timing.late_poses and run.n_ul_received is not None:
+        yield (
+            f"{timing.late_poses} poses came a sampling period or more too late: age by receive time at most "
+            f"{_steps(run, run.n_ul_received)}, by stamps {int(run.n_ul.max())}"
+        )
+    if timing.late_commands and run.n_dl_received is not None:
+        yield (
+            f"{timing.late_commands} commands came after the step that they were for had ended: the newest that the "
+            f"AGV had was at most {_steps(run, run.n_dl_received)} old"
+        )
+    yield (
+        f"the timing was not what the stamps say: the pose behind a command that acted was at most "
+        f"{_steps(run, timing.command_age)} old"
+    )
+
+
+def _steps(run: Run, age: NDArray[np.int64]) -> str:
+    most = int(age.max())
+    return f"{most} steps ({most * run.ts:g} s)"
+
+
+def _ms(duration: float) -> str:
+    return f"{duration * 1e3:.3g} ms"
