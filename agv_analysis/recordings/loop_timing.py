@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,7 +109,8 @@ def _as_received(messages: NDArray[np.void], grid: Grid) -> OnSteps:
 
 
 def _logs(messages: OnSteps) -> Steps:
-    return np.asarray(messages.messages[LOG_TIME], dtype=np.int64)
+    """Log times [ns] of messages, shape (M,)."""
+    return np.asarray(messages.messages[LOG_TIME], dtype=np.int64) if len(messages.k) else messages.k
 
 
 def _as_received_at_edge_and_agv(run: Run, topics: Mapping[str, OnSteps], said: Deadlines | None) -> Run:
@@ -118,31 +120,70 @@ def _as_received_at_edge_and_agv(run: Run, topics: Mapping[str, OnSteps], said: 
     ends = _ends(run, topics["agv/pose"], first, count, said)
     n_ul, n_dl = _dense(run.n_ul, rows), _dense(_stamped_downlink_age(run), rows)
 
-    poses = topics.get("edge/pose", NOTHING)
-    pose_steps, pose_logs = poses.k - first, _logs(poses) if len(poses.k) else poses.k
-    poses_usable = usable_from(pose_steps, pose_logs, ends)
-    held_pose = newest_held(pose_steps, poses_usable, count)
+    poses = _arrivals(topics["edge/pose"], first) if "edge/pose" in topics else None
+    n_ul_received = None if poses is None else _age(poses, ends)
+    sent = _sent(topics["edge/cmd_vel"], first, ends)
+    behind = steps - n_ul if poses is None else np.minimum(_pose_behind(poses, sent), steps - n_ul)
 
     commands = topics["agv/cmd_vel"] if len(topics.get("agv/cmd_vel", NOTHING).k) else topics["edge/cmd_vel"]
-    taken = _not_ignored(commands, topics["agv/pose"], said)
-    command_steps, command_logs = commands.k[taken] - first, _logs(commands)[taken] if len(commands.k) else commands.k
-    commands_usable = usable_from(command_steps, command_logs, ends)
-    held_command = newest_held(command_steps, commands_usable, count)
+    taken = _arrivals(_not_ignored(commands, topics["agv/pose"], said), first)
+    n_dl_received = _age(taken, ends)
 
-    behind = np.minimum(_pose_behind(topics, pose_steps, pose_logs, ends, first), steps - n_ul)
-    n_ul_received = np.where(held_pose >= 0, steps - held_pose, n_ul)
-    n_dl_received = np.where(held_command >= 0, steps - held_command, np.maximum(n_dl, steps))
-    by_receive_time = np.where(held_command >= 0, steps - behind[np.maximum(held_command, 0)], steps)
-    by_stamps = n_dl + n_ul[np.maximum(steps - n_dl, 0)]
+    by_receive_time = n_dl_received + _age_when_sent(behind, n_dl_received)
+    by_stamps = n_dl + _age_when_sent(steps - n_ul, n_dl)
     acted = np.maximum(by_receive_time, by_stamps)[rows]
     begun = rows > min(START_UP / run.ts, count / 10.0)
     timing = Timing(
         is_late=is_more_than_jitter((acted - _explained_by_losses(run, n_ul, rows))[begun]),
         command_age=acted,
-        late_poses=int(np.count_nonzero(poses_usable > pose_steps)),
-        late_commands=int(np.count_nonzero(commands_usable > command_steps)),
+        late_poses=0 if poses is None else _late(poses, ends),
+        late_commands=_late(taken, ends),
     )
-    return dataclasses.replace(run, timing=timing, n_ul_received=n_ul_received[rows], n_dl_received=n_dl_received[rows])
+    return dataclasses.replace(
+        run,
+        timing=timing,
+        n_ul_received=None if n_ul_received is None else n_ul_received[rows],
+        n_dl_received=n_dl_received[rows],
+    )
+
+
+class Arrivals(NamedTuple):
+    """Messages of a topic by their steps, counted from the first of the run, and when they came; shape (M,)."""
+
+    steps: Steps
+    logs: Steps
+
+
+def _arrivals(messages: OnSteps, first: int) -> Arrivals:
+    return Arrivals(messages.k - first, _logs(messages))
+
+
+def _age(arrivals: Arrivals, ends: Steps) -> Steps:
+    """Steps since the freshest message that had come when each step ended, since the beginning if none had; (N,)."""
+    held = newest_held(arrivals.steps, usable_from(*arrivals, ends), len(ends))
+    return np.asarray(np.arange(len(ends)) - np.maximum(held, 0))
+
+
+def _late(arrivals: Arrivals, ends: Steps) -> int:
+    """How many messages came after their own step had ended."""
+    return int(np.count_nonzero(usable_from(*arrivals, ends) > arrivals.steps))
+
+
+def _sent(commands: OnSteps, first: int, ends: Steps) -> Steps:
+    """Log time until which poses could be used for the command of each step: it was sent, or its step ended; (N,)."""
+    index, there = commands.at(np.arange(len(ends)) + first)
+    return np.where(there, np.maximum(ends, _logs(commands)[index]), ends) if there.any() else ends
+
+
+def _pose_behind(poses: Arrivals, sent: Steps) -> Steps:
+    """Step of the freshest pose that had come when the command of each step was sent, shape (N,); 0 if none had."""
+    return np.clip(newest_at(*poses, sent), 0, np.arange(len(sent)))
+
+
+def _age_when_sent(behind: Steps, command_age: Steps) -> Steps:
+    """Age of the pose behind a command when that was sent, of the command that is `command_age` old at each step."""
+    command = np.maximum(np.arange(len(behind)) - command_age, 0)  # one from before the recording has no pose in it
+    return np.asarray(command - behind[command])
 
 
 def is_more_than_jitter(excess: NDArray[np.int64]) -> bool:
@@ -168,22 +209,13 @@ def _ends(run: Run, poses: OnSteps, first: int, count: int, said: Deadlines | No
     return np.maximum.accumulate(np.clip(published, due, due + leeway))
 
 
-def _not_ignored(commands: OnSteps, poses: OnSteps, said: Deadlines | None) -> NDArray[np.bool_]:
-    """Which commands the plant took: if it says that it ignored some, not those that came before their own instant."""
+def _not_ignored(commands: OnSteps, poses: OnSteps, said: Deadlines | None) -> OnSteps:
+    """The commands that the plant took: if it says that it ignored some, not those that came before their instant."""
     if said is None or not said.ignored or not len(commands.k):
-        return np.ones(len(commands.k), dtype=np.bool_)
+        return commands
     index, there = poses.at(commands.k)
-    return ~there | (_logs(commands) >= _logs(poses)[index])
-
-
-def _pose_behind(topics: Mapping[str, OnSteps], steps: Steps, logs: Steps, ends: Steps, first: int) -> Steps:
-    """Step of the freshest pose that the command of each step could use, shape (N,): had come when it was sent."""
-    own, sent = np.arange(len(ends)), ends.copy()
-    index, there = topics["edge/cmd_vel"].at(own + first)
-    if there.any():
-        sent[there] = np.maximum(sent[there], _logs(topics["edge/cmd_vel"])[index[there]])
-    newest = newest_at(steps, logs, sent)
-    return np.where(newest >= 0, np.minimum(newest, own), own)
+    taken = ~there | (_logs(commands) >= _logs(poses)[index])
+    return commands._replace(k=commands.k[taken], messages=commands.messages[taken])
 
 
 def _stamped_downlink_age(run: Run) -> Steps:
@@ -203,14 +235,16 @@ def _explained_by_losses(run: Run, n_ul: Steps, rows: Steps) -> Steps:
     received = np.flatnonzero(~run.lost)
     before = rows[received[0]] if len(received) else len(n_ul)
     explained = np.where(np.arange(len(n_ul)) < before, n_ul, lost)
-    late = ages(run.k, run.downlink_lost)
-    return np.asarray(late + explained[np.maximum(rows - late, 0)])
+    since = ages(run.k, run.downlink_lost)
+    return np.asarray(since + explained[rows - since])
 
 
 def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str]:
     """What a reader must know of the timing of a run in real time."""
     if timing.unknown:
         yield f"{timing.unknown}: when poses and commands came is not recorded, ages are those of the stamps"
+    elif run.n_ul_received is None:
+        yield "edge/pose is not in the recording: when poses came to the edge is not known"
     if said is None:
         yield "the plant's diagnostics are not in the recording: missed deadlines are not known"
     elif said.missed:
@@ -222,7 +256,7 @@ def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str
         yield f"the AGV stopped {said.stops} times because its newest command was older than plant.cmd_vel_timeout"
     if said is not None and said.missed_edge_steps:
         yield f"the edge missed {said.missed_edge_steps} of its steps"
-    if timing.is_late and run.n_ul_received is not None and run.n_dl_received is not None:
+    if timing.is_late:
         yield from late_sentences(run, timing)
         if said is not None and said.ignored > RARE * said.steps:
             yield f"the AGV ignored {said.ignored} commands, which came after a newer one or before their own instant"

@@ -34,8 +34,7 @@ def with_timing(run: Run, bag: Bag, command_topic: str | None, came: Track, k: S
         return dataclasses.replace(run, timing=timing, notes=(*run.notes, sentence))
     steps = np.arange(len(run))
     late = periods_late(line, came.stamps, came.log_times, run.ts)
-    held = newest_held(k, k + late, len(run))
-    n_ul = np.where(held >= 0, steps - held, run.n_ul)
+    n_ul = steps - np.maximum(newest_held(k, k + late, len(run)), 0)
     behind, late_commands = _commands_behind(bag, command_topic, came, run)
     age = n_ul if behind is None else behind + n_ul[steps - behind]
     age = np.maximum(age, run.n_ul)
