@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 _WINDOW = 20_000
 
 
 class DeadlineMonitor:
-    """Statistics of ticks that are due every `period_ns`.
+    """Statistics of ticks that are due every `period_ns`, up to number `last`.
 
-    A tick belongs to the nearest multiple of the period. Each multiple without a tick is a missed deadline.
+    A tick belongs to the nearest multiple of the period. Each multiple without a tick is a missed deadline. After the
+    last one none is due, so a late tick at the end of a run misses no more than were left.
     """
 
-    def __init__(self, period_ns: int) -> None:
+    def __init__(self, period_ns: int, last: float = math.inf) -> None:
         self._period_ns = period_ns
+        self._last = last
         self._first_ns = 0
         self._last_ns = 0
         self._due = 0
@@ -29,7 +33,8 @@ class DeadlineMonitor:
 
     def tick(self, now_ns: int) -> int:
         """Record a tick; returns its number."""
-        number = (now_ns - self._first_ns + self._period_ns // 2) // self._period_ns
+        nearest = (now_ns - self._first_ns + self._period_ns // 2) // self._period_ns
+        number = int(min(nearest, self._last))
         if number > self._due:
             self.missed += number - self._due - 1
             self._jitter_ns[self._count % _WINDOW] = abs(now_ns - self._last_ns - self._period_ns)

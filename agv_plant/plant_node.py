@@ -79,7 +79,7 @@ class PlantNode(LoopNode[PlantParameters]):
         self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
         self._join: MessageSync[Command] = MessageSync(self.grid.start_ns)
         self._held = ZeroOrderHold(to_nanoseconds(settings.cmd_vel_timeout))
-        self.deadline_monitor = DeadlineMonitor(self.grid.ts_ns)
+        self.deadline_monitor = DeadlineMonitor(self.grid.ts_ns, self.steps)
         self._lockstep = settings.clock == "lockstep"
         self._pose_out = self.output(PoseStamped, "agv/pose")
         self._clock_out = self.output(Clock, "/clock", side=True)

@@ -93,9 +93,10 @@ def deadlines_of(diagnostics: NDArray[np.void], namespace: str, steps: int) -> D
     if "missed deadlines" not in plant:
         return None
     edge = reports_of(diagnostics, f"{namespace}error_detector")
+    steps = round(max(plant.get("step", [steps])))
     return Deadlines(
-        steps=round(max(plant.get("step", [steps]))),
-        missed=total(plant["missed deadlines"]),
+        steps=steps,
+        missed=min(total(plant["missed deadlines"]), steps),  # plants counted on after the last step, once
         longest_overdue=max(plant.get("jitter max", [0.0])),
         stops=total(plant.get("stops without command", [0.0])),
         ignored=total(plant.get("outdated commands", [0.0])),

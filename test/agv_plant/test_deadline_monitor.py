@@ -68,3 +68,10 @@ def test_of_a_long_run_the_last_lap_counts() -> None:
     assert set(found.summary().values()) == {0.0}
     assert found.tick(20_105 * PERIOD) == 20_105
     assert found.missed == 3
+
+
+def test_no_deadline_is_missed_after_the_last_one() -> None:
+    deadline_monitor = DeadlineMonitor(PERIOD, last=5)
+    deadline_monitor.start(0)
+    assert [deadline_monitor.tick(at * PERIOD) for at in (1, 2, 9, 12)] == [1, 2, 5, 5]
+    assert deadline_monitor.missed == 2

@@ -32,7 +32,7 @@ def longest_for(loop: LinearLoop, seen: int = 0) -> int:
 
 
 def _judge(facts: RunFacts) -> Judgement | None:
-    if not facts.is_feasible:
+    if not facts.is_feasible or facts.run.is_late:  # then no fresh pose need end an outage
         return None
     found = joint_spectral_radius.verdict(facts.loop, facts.n)
     stable = {joint_spectral_radius.STABLE: True, UNSTABLE: False}.get(found.verdict)

@@ -37,6 +37,10 @@ def _judge(facts: RunFacts) -> Judgement | None:
         return None
     both = growth_on_both_links(facts)
     growth = mean_square.lap_growth(facts.loop, facts.fit.chain) / len(facts.run) if both is None else both
+    if facts.run.is_late:
+        values = {"mean_square_stable": None, "mean_square_growth": None}
+        why = "no channel that is fitted to the losses explains how late poses and commands came"
+        return Judgement("Mean square", None, why, values, (growth, both))
     links = "" if both is None else " of both links"
     return Judgement(
         "Mean square", growth < 0.0, f"E[e^2] times {math.exp(growth):.6g} a step under the fitted channel{links}",
