@@ -2,7 +2,8 @@
 
 A run in lockstep has no timing: its steps take what they take, and nothing is said of it. In real time the plant takes
 step k when it publishes the pose of step k + 1; which poses and commands had come by then, the log times say. That is
-exact if the recorder hears `edge/*` at the edge and `agv/*` at the AGV without delay, as beside a relay it does.
+exact if the recorder hears `edge/*` at the edge and `agv/*` at the AGV without delay, as beside a relay it does. Where
+the AGV took a command later than the recorder heard it, its motion says so.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.bags.writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.metrics.outages import ages
+from agv_analysis.recordings.acting_commands import command_ages, obeys_at_once
 from agv_analysis.recordings.messages_on_steps import NOTHING, OnSteps, Steps, on_steps, stamps_of
 from agv_analysis.recordings.node_reports import reports_of, total
 from agv_analysis.recordings.receive_times import (
@@ -127,8 +129,10 @@ def _as_received_at_edge_and_agv(run: Run, topics: Mapping[str, OnSteps], said: 
     behind = steps - n_ul if poses is None else np.minimum(_pose_behind(poses, sent), steps - n_ul)
 
     commands = topics["agv/cmd_vel"] if len(topics.get("agv/cmd_vel", NOTHING).k) else topics["edge/cmd_vel"]
-    taken = _arrivals(_not_ignored(commands, topics["agv/pose"], said), first)
-    n_dl_received = _age(taken, ends)
+    if said is not None and said.ignored and not obeys_at_once(run):
+        commands = _not_ignored(commands, topics["agv/pose"])
+    taken = _arrivals(commands, first)
+    n_dl_received = np.maximum(_age(taken, ends), _dense(command_ages(run), rows))
 
     by_receive_time = n_dl_received + _age_when_sent(behind, n_dl_received)
     by_stamps = n_dl + _age_when_sent(steps - n_ul, n_dl)
@@ -210,9 +214,9 @@ def _ends(run: Run, poses: OnSteps, first: int, count: int, said: Deadlines | No
     return np.maximum.accumulate(np.clip(published, due, due + leeway))
 
 
-def _not_ignored(commands: OnSteps, poses: OnSteps, said: Deadlines | None) -> OnSteps:
-    """The commands that the plant took: if it says that it ignored some, not those that came before their instant."""
-    if said is None or not said.ignored or not len(commands.k):
+def _not_ignored(commands: OnSteps, poses: OnSteps) -> OnSteps:
+    """The commands that a plant took which ignored some: not those that came before their own instant."""
+    if not len(commands.k):
         return commands
     index, there = poses.at(commands.k)
     taken = ~there | (_logs(commands) >= _logs(poses)[index])
@@ -270,10 +274,11 @@ def late_sentences(run: Run, timing: Timing) -> Iterator[str]:
             f"{timing.late_poses} poses came a sampling period or more too late: age by receive time at most "
             f"{_steps(run, run.n_ul_received)}, by stamps {int(run.n_ul.max())}"
         )
-    if timing.late_commands and run.n_dl_received is not None:
+    oldest = 0 if run.n_dl_received is None else int(run.n_dl_received.max())
+    if run.n_dl_received is not None and oldest > (0 if run.n_dl is None else int(run.n_dl.max())):
         yield (
-            f"{timing.late_commands} commands came after the step that they were for had ended: the newest that the "
-            f"AGV had was at most {_steps(run, run.n_dl_received)} old"
+            f"{timing.late_commands} commands came after the step that they were for had ended; the AGV acted on "
+            f"commands at most {_steps(run, run.n_dl_received)} old"
         )
     yield (
         f"the timing was not what the stamps say: the pose behind a command that acted was at most "

@@ -62,6 +62,5 @@ def test_a_controller_that_takes_too_long_shows_in_the_ages(drive: Drive) -> Non
     truth = commands_that_acted(run)
     known = [k for k, age in enumerate(truth) if age is not None]
     assert len(known) > 20
-    same = [int(run.n_dl_received[k]) == truth[k] for k in known]
-    assert np.mean(same) > 0.9
+    assert all(run.n_dl_received[k] >= (truth[k] or 0) for k in known), "no age is smaller than the one that acted"
     assert max(truth[k] or 0 for k in known) > 2

@@ -6,6 +6,8 @@ following all events in the order of their log times, one by one.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -286,14 +288,33 @@ def test_a_plant_that_was_started_again_goes_on_counting(tmp_path: Path) -> None
 
 
 def test_commands_that_the_agv_ignored_did_not_act(tmp_path: Path) -> None:
-    """The edge is ahead of the AGV: a command comes before its instant, and the AGV says that it ignores those."""
+    """The edge is ahead of the AGV: a command comes before its instant, and the AGV says that it ignores those.
+
+    It has a lag, so that its motion does not say which command it obeys.
+    """
+    truth = simulated(400, "plant.lag=0.1")
     ahead = {"edge/cmd_vel": lambda k: -2.0 * (k % 2), "agv/cmd_vel": lambda k: -2.0 * (k % 2)}
     said = {"missed deadlines": "0", "outdated commands": "200"}
-    run = read_run(write(tmp_path / "bag", simulated(400), ahead, (said,))[0])
+    run = read_run(write(tmp_path / "bag", truth, ahead, (said,))[0])
     assert received(run)[1] == [k % 2 for k in range(400)]
     assert run.is_late
-    trusted = read_run(write(tmp_path / "other", simulated(400), ahead, ({**said, "outdated commands": "0"},))[0])
+    trusted = read_run(write(tmp_path / "other", truth, ahead, ({**said, "outdated commands": "0"},))[0])
     assert not trusted.is_late
+
+
+@pytest.mark.parametrize("taken_late", [{}, {k: k - 99 for k in range(100, 112)} | {200: 1, 201: 2, 300: 3}])
+def test_the_motion_says_which_command_the_agv_obeyed(tmp_path: Path, taken_late: dict[int, int]) -> None:
+    """The recorder hears every command in time, but the AGV takes some of them later."""
+    truth = simulated(400)
+    x, y, theta = truth.pose[0].tolist()
+    poses = [(x, y, theta)]
+    for k in range(399):
+        v, w = truth.command[k - taken_late.get(k, 0)].tolist()
+        x, y, theta = x + 0.005 * v * math.cos(theta), y + 0.005 * v * math.sin(theta), theta + 0.005 * w
+        poses.append((x, y, theta))
+    run = read_run(write(tmp_path / "bag", dataclasses.replace(truth, pose=np.array(poses)))[0])
+    assert received(run)[1] == [taken_late.get(k, 0) for k in range(400)]
+    assert run.is_late == bool(taken_late)
 
 
 def test_where_log_times_are_stamps_the_run_says_that_it_does_not_know(tmp_path: Path) -> None:
