@@ -123,7 +123,7 @@ def _as_received_at_edge_and_agv(run: Run, topics: Mapping[str, OnSteps], said: 
     ends = _ends(run, topics["agv/pose"], first, count, said)
     n_ul, n_dl = _dense(run.n_ul, rows), _dense(_stamped_downlink_age(run), rows)
 
-    poses = _arrivals(topics["edge/pose"], first) if "edge/pose" in topics else None
+    poses = _arrivals(topics["edge/pose"], first) if len(topics.get("edge/pose", NOTHING).k) else None
     n_ul_received = None if poses is None else _age(poses, ends)
     sent = _sent(topics["edge/cmd_vel"], first, ends)
     behind = steps - n_ul if poses is None else np.minimum(_pose_behind(poses, sent), steps - n_ul)

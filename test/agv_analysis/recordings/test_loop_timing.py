@@ -19,12 +19,15 @@ from mcap.reader import make_reader
 from agv_analysis.bags.writer import REPLAY_OF, BagWriter, TopicInfo
 from agv_analysis.recordings.loop_timing import is_more_than_jitter
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.report.panels import age as age_panel
+from agv_analysis.report.table import rows
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability.analysis import observe
+from agv_analysis.stability.analysis import analyse, observe
 from agv_analysis.stability.criteria.criterion import RunFacts
 from agv_analysis.stability.criteria.recorded_losses import CRITERION
+from agv_analysis.stability.verdict import ASYMPTOTIC, MEAN_SQUARE
 from agv_ros.codec import encode_command, encode_diagnostics, encode_error, encode_pose, encode_slot
 from agv_ros.messages import DELIVERED, LOST, Command, Slot, StampedPose, TrackingError
 
@@ -204,7 +207,13 @@ def test_poses_that_wait_and_come_together_have_the_age_of_the_wait(tmp_path: Pa
     judged = CRITERION.judge(facts)
     assert judged is not None
     assert judged.stable is False
-    found = observe(run).to_json()
+    analysed = analyse(run)
+    assert analysed.verdict.word not in (ASYMPTOTIC, MEAN_SQUARE)
+    assert analysed.judgements["mean_square"].stable is None
+    assert "bursts" not in analysed.judgements
+    assert any("at most 1000 steps (5 s)" in value for name, value in rows(analysed) if name == "Age by receive time")
+    assert [len(line.x) for line in age_panel(run).lines] == [2600, 2600]
+    found = analysed.to_json()
     assert found["timing"]["late"]
     assert (found["n_ul_max"], found["timing"]["command_age_max"]) == (0, 1000)
 
@@ -343,3 +352,35 @@ def test_one_step_now_and_then_is_jitter() -> None:
     excess[10] = 1
     assert is_more_than_jitter(excess)
     assert is_more_than_jitter(np.array([0] * 10_000 + [2]))
+
+
+def test_without_the_poses_at_the_edge_only_commands_are_held_against_the_clock(tmp_path: Path) -> None:
+    late: dict[str, Delay] = {"agv/cmd_vel": lambda k: burst(k, 90, 40)}
+    run = read_run(write(tmp_path / "bag", simulated(400), late, without=("edge/pose",))[0])
+    assert run.n_ul_received is None
+    assert "edge/pose is not in the recording: when poses came to the edge is not known" in run.notes
+    assert run.is_late
+    assert run.command_age.max() == 40
+
+
+def test_the_growth_of_a_late_run_is_that_of_its_own_ages(tmp_path: Path) -> None:
+    """Poses wait for 55 of 60 steps: the error along a straight track, e(k+1) = e(k) - a e(k - n(k)), grows fastest."""
+    run = read_run(write(tmp_path / "bag", simulated(600, "error_detector.track=line"),
+                         {"edge/pose": lambda k: burst(k, 60, 55)})[0])  # fmt: skip
+    a, errors = run.ts * run.scenario.controller.kx, [1.0]
+    for k in range(600):
+        errors.append(errors[k] - a * errors[k - int(run.command_age[k])])
+    judged = CRITERION.judge(RunFacts(run))
+    assert judged is not None
+    assert judged.values["floquet_multiplier_per_step"] == pytest.approx(abs(errors[-1]) ** (1 / 600), rel=1e-6)
+    assert abs(errors[-1]) > 1.0
+    assert judged.stable is False
+
+
+def test_an_agv_that_stopped_is_not_judged_as_one_that_held_its_command(tmp_path: Path) -> None:
+    run = read_run(write(tmp_path / "bag", simulated(1000), {"agv/cmd_vel": lambda k: burst(k, 400, 200)})[0])
+    assert run.n_dl_received is not None
+    assert run.n_dl_received.max() * run.ts > run.scenario.plant.cmd_vel_timeout
+    judged = CRITERION.judge(RunFacts(run))
+    assert judged is not None
+    assert judged.stable is None
