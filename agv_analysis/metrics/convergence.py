@@ -1,65 +1,46 @@
-"""How a run's error converges: settling, overshoot, integrals, and how the command is damped.
+"""How a run's error converges: settling and overshoot of the initial error, integrals, how the command is damped.
 
 A run judges itself only as far as it goes: an error that has settled when the run ends may leave its band afterwards.
-What a run cannot say is None: the share of an initial error of zero, the settling that did not happen, the damping of a
-command that did not move or that ended too early.
+What a run cannot say is None, with a reason: the share of an initial error of zero, the settling that did not happen,
+the damping of a command that did not move or that ended too early.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from agv_analysis.metrics.bands import CRITICAL_TIME, NEGLIGIBLE, SHARE, TOLERANCE
+from agv_analysis.metrics.error_metrics import (
+    ErrorMetrics,
+    body_errors,
+    error_metrics,
+    settling,
+    sign_changes,
+    wrapped,
+)
+from agv_analysis.metrics.initial_error import InitialError, against_twin, first_outage, until_first_outage
+from agv_analysis.metrics.last_excursion import LastExcursion, last_excursion
 from agv_analysis.run import Floats, Run
-from agv_cloud.tracking_error import tracking_error
+from agv_analysis.simulation.twin_on_reference import twin_on_reference
 from agv_ros.errors import UserError
 
-TOLERANCE = 0.01
-"""Absolute band of settling: 1 cm; 0.01 rad for an angle."""
-
-SHARE = 0.02
-"""Relative band of settling: 2 % of the initial error, or of the largest deviation of a command."""
-
-NEGLIGIBLE = 1e-9
-"""An initial error up to this size [m, rad] is rounding, of which no share is taken."""
-
-CRITICAL_TIME = 0.25
-"""Longest settling [s] of a critically damped command after its last saturated sample."""
-
-
-@dataclass(frozen=True)
-class ErrorMetrics:
-    """Metrics of one component of the error over a run; in m, for an angle in rad.
-
-    Steps count from the first step of the run. A step whose error is not finite lies outside every band.
-    """
-
-    initial: float
-    final: float
-    peak: float
-    """Largest absolute value."""
-    settle_1cm_steps: int | None
-    """First step from which on |e| is below 1 cm (0.01 rad); None if that did not happen."""
-    settle_2pct_steps: int | None
-    """First step from which on |e| is below 2 % of its initial value; None if that did not happen or e began at 0."""
-    overshoot: float | None
-    """Largest error on the other side of zero as a share of the initial one; None if that is 0."""
-    sign_changes: int
-    """How often e went from beyond 1 cm (0.01 rad) on one side to beyond it on the other."""
-    iae: float
-    """Integral of |e| over time, [m s]: T_s sum |e(k)|."""
-    ise: float
-    """Integral of e^2 over time, [m^2 s]; inf where it overflows."""
+__all__ = [
+    "CRITICAL_TIME", "NEGLIGIBLE", "SHARE", "TOLERANCE", "Convergence", "ErrorMetrics", "body_errors", "convergence",
+    "damping", "error_metrics", "settling", "sign_changes", "wrapped",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Convergence:
     """Convergence of one run.
 
-    The paper plots the global y error and writes of the one in the AGV's frame: here are both, apart. All errors are
-    the true ones at each step, X_r(k) - X_c(k), not those that the edge computed from an outdated pose.
+    Settling, overshoot and damping are those of the initial error, apart from what outages do. The metrics of the
+    single errors are of all that happened. The paper plots the global y error and writes of the one in the AGV's frame:
+    here are both, apart. All errors are the true ones at each step, X_r(k) - X_c(k), not those that the edge computed
+    from an outdated pose.
     """
 
     y: ErrorMetrics
@@ -72,23 +53,53 @@ class Convergence:
     """Error of heading [rad], in (-pi, pi]."""
     position: ErrorMetrics
     """Distance between AGV and reference [m]; it has no sign, hence neither overshoot nor changes of sign."""
+    initial: InitialError
+    """What becomes of the error that the run began with."""
     damping: str | None
     """Damping class of the command: `over`, `critical`, `under`; None if the run cannot tell."""
+    excursion: LastExcursion | None
+    """The last time that the AGV was 1 cm or more away from its reference; None if it never was."""
+    max_error_after_settling: float | None
+    """Largest distance [m] from settle_1cm_steps on, or of the whole run if it began on its reference."""
 
     @property
     def settle_1cm_steps(self) -> int | None:
-        """First step from which on |y_r - y_c| is below 1 cm."""
-        return self.y.settle_1cm_steps
+        """First step from which on less than 1 cm is left of the initial error."""
+        return self.initial.settle_1cm_steps
 
     @property
     def settle_2pct_steps(self) -> int | None:
-        """First step from which on |y_r - y_c| is below 2 % of its initial value."""
-        return self.y.settle_2pct_steps
+        """First step from which on less than 2 % is left of the initial error."""
+        return self.initial.settle_2pct_steps
 
     @property
     def overshoot(self) -> float | None:
-        """Overshoot of y_r - y_c as a share of its initial value."""
-        return self.y.overshoot
+        """How far the initial error comes to the other side, as a share of its size."""
+        return self.initial.overshoot
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; SI units; null: the run cannot say, or the number is infinite."""
+        return {
+            "settle_1cm_steps": self.settle_1cm_steps,
+            "settle_2pct_steps": self.settle_2pct_steps,
+            "overshoot": _finite(self.overshoot),
+            "damping": self.damping,
+            "convergence_of": self.initial.of,
+            "convergence_reason": self.initial.reason or None,
+            "last_excursion_seconds": None if self.excursion is None else self.excursion.seconds,
+            "last_excursion_after": None if self.excursion is None else self.excursion.after,
+            "initial_error": _finite(self.position.initial),
+            "final_error": _finite(self.position.final),
+            "max_error": _finite(self.position.peak),
+            "max_error_after_settling": _finite(self.max_error_after_settling),
+            "iae": _finite(self.y.iae),
+            "ise": _finite(self.y.ise),
+        }
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON has no infinity."""
+    return value if value is not None and np.isfinite(value) else None
 
 
 def convergence(run: Run, critical_time: float = CRITICAL_TIME) -> Convergence:
@@ -100,71 +111,43 @@ def convergence(run: Run, critical_time: float = CRITICAL_TIME) -> Convergence:
         raise UserError(f"{run.source}: no step of the loop in it, so nothing converges: record at least one")
     true = run.reference[:, :3] - run.pose
     body = body_errors(run.reference, run.pose)
+    distance = np.hypot(true[:, 0], true[:, 1])
+    initial, damped, left = _of_initial_error(run, body, critical_time)
     return Convergence(
         y=error_metrics(run.k, true[:, 1], run.ts),
         x_e=error_metrics(run.k, body[:, 0], run.ts),
         y_e=error_metrics(run.k, body[:, 1], run.ts),
         theta_e=error_metrics(run.k, wrapped(body[:, 2]), run.ts),
-        position=error_metrics(run.k, np.hypot(true[:, 0], true[:, 1]), run.ts),
-        damping=damping(
-            run.time, run.command[:, 0], run.reference[:, 3], run.scenario.controller.v_max, critical_time
-        ),
-    )  # fmt: skip
-
-
-def body_errors(reference: Floats, pose: Floats) -> Floats:
-    """eps(k) = T_e(theta_c(k)) [X_r(k) - X_c(k)] (the paper's eq. 10) at every step, shape (N, 3).
-
-    `reference` has shape (N, 3) or more columns, of which the first three count; `pose` has shape (N, 3).
-    """
-    rows = zip(reference[:, :3].tolist(), pose.tolist(), strict=True)
-    return np.array([tracking_error(*x_r, *x_c) for x_r, x_c in rows], dtype=np.float64).reshape(-1, 3)
-
-
-def wrapped(angle: Floats) -> Floats:
-    """Angles [rad] brought into (-pi, pi]."""
-    return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi))
-
-
-def error_metrics(k: NDArray[np.int64], e: Floats, ts: float) -> ErrorMetrics:
-    """Metrics of an error e(k) at the steps k, shapes (N,), N >= 1, with sampling period `ts` [s]."""
-    initial, size = float(e[0]), np.abs(e)
-    started = abs(initial) > NEGLIGIBLE
-    with np.errstate(over="ignore"):
-        iae, ise = float(np.sum(size) * ts), float(np.sum(e * e) * ts)
-    return ErrorMetrics(
+        position=error_metrics(run.k, distance, run.ts),
         initial=initial,
-        final=float(e[-1]),
-        peak=float(np.max(size)),
-        settle_1cm_steps=_settling_step(k, size, TOLERANCE),
-        settle_2pct_steps=_settling_step(k, size, SHARE * abs(initial)) if started else None,
-        overshoot=_overshoot(e) if started else None,
-        sign_changes=sign_changes(e, TOLERANCE),
-        iae=iae,
-        ise=ise,
+        damping=damped,
+        excursion=last_excursion(run, distance, left),
+        max_error_after_settling=_after_settling(run, initial, distance),
     )
 
 
-def settling(size: Floats, band: float) -> int | None:
-    """First index from which on `size`, shape (N,), stays below `band`; None if its last value is not below."""
-    outside = np.flatnonzero(~(size < band))  # so written, NaN is outside
-    first = int(outside[-1]) + 1 if len(outside) else 0
-    return first if first < len(size) else None
+def _of_initial_error(
+    run: Run, body: Floats, critical_time: float
+) -> tuple[InitialError, str | None, Floats | None]:  # fmt: skip
+    """What becomes of the initial error, how the command answers to it, and how much [m] is left of it, if known."""
+    v_max, v = run.scenario.controller.v_max, run.command[:, 0]
+    twin = twin_on_reference(run)
+    if isinstance(twin, str):
+        end = first_outage(run)
+        damped = damping(run.time[:end], v[:end], run.reference[:end, 3], v_max, critical_time)
+        return until_first_outage(run, body, twin), damped, None
+    left = body_errors(twin.pose, run.pose)
+    damped = damping(run.time, v, twin.speed, v_max, critical_time)
+    return against_twin(run, left), damped, np.hypot(left[:, 0], left[:, 1])
 
 
-def _settling_step(k: NDArray[np.int64], size: Floats, band: float) -> int | None:
-    index = settling(size, band)
-    return None if index is None else int(k[index] - k[0])
-
-
-def _overshoot(e: Floats) -> float:
-    return max(0.0, float(np.max(-e * np.sign(e[0])))) / abs(float(e[0]))
-
-
-def sign_changes(e: Floats, band: float) -> int:
-    """How often e, shape (N,), goes from above `band` to below `-band` or back, whatever it does in between."""
-    sides = np.sign(e[np.abs(e) > band])
-    return int(np.count_nonzero(np.diff(sides)))
+def _after_settling(run: Run, initial: InitialError, distance: Floats) -> float | None:
+    """Largest distance after the initial error has settled."""
+    if initial.has_nothing_to_settle:
+        return float(distance.max())
+    if initial.settle_1cm_steps is None:
+        return None
+    return float(distance[run.k - run.k[0] >= initial.settle_1cm_steps].max())
 
 
 def damping(time: Floats, v: Floats, v_r: Floats, v_max: float, critical_time: float = CRITICAL_TIME) -> str | None:

@@ -148,9 +148,14 @@ def age_statistics(age: Steps, ts: float) -> Age:
 
 def outage_lengths(k: Steps, lost: Outcomes) -> Steps:
     """Length of each series of consecutive lost slots, in the order of time; `k` and `lost` have shape (N,)."""
-    begins = np.flatnonzero(lost & ~_follows_lost(k, lost))
+    begins = outage_begins(k, lost)
     ends = np.flatnonzero(lost & ~_follows_lost(-k[::-1], lost[::-1])[::-1])
     return np.asarray(ends - begins + 1, dtype=np.int64)
+
+
+def outage_begins(k: Steps, lost: Outcomes) -> Steps:
+    """Index of the first slot of each of these series."""
+    return np.asarray(np.flatnonzero(lost & ~_follows_lost(k, lost)), dtype=np.int64)
 
 
 def _follows_lost(k: Steps, lost: Outcomes) -> Outcomes:

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.metrics.convergence import TOLERANCE, body_errors, wrapped
+from agv_analysis.metrics.bands import TOLERANCE
+from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability.analysis import Analysis, Observations

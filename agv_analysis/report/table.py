@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.metrics.convergence import Convergence
+from agv_analysis.metrics.last_excursion import LastExcursion
 from agv_analysis.metrics.outages import loss_causes
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
@@ -92,11 +94,7 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
             "Downlink",
             f"{down.loss_rate:.2%} lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
         )
-    found = analysis.convergence
-    yield "Settling", f"{_steps(found.settle_1cm_steps, ms)} to 1 cm, {_steps(found.settle_2pct_steps, ms)} to 2 %"
-    yield "Overshoot", "no initial error" if found.overshoot is None else f"{found.overshoot:.2%}"
-    yield "Damping of the speed", found.damping or "the run cannot tell"
-    yield "Error", f"at most {found.position.peak:.3g} m, {found.position.final:.3g} m at the end"
+    yield from convergence_rows(analysis.convergence, ms)
     yield "Fitted channel", _fit(analysis)
     if run.unexplained:
         yield "Stability", _NOT_JUDGED
@@ -109,6 +107,44 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
 def _disagreements(analysis: Observations) -> list[str]:
     """Sentences on criteria that disagree; none of a recording that proves nothing."""
     return [] if analysis.run.unexplained else analysis.disagreements()
+
+
+def convergence_rows(found: Convergence, ms: float) -> Iterator[tuple[str, str]]:
+    """What becomes of the initial error, and how far away the AGV was; `ms` is the sampling period."""
+    from rich.markup import escape
+
+    first = found.initial
+    bands = {"1 cm": first.settle_1cm_steps, "2 %": first.settle_2pct_steps}
+    seen = [f"{steps} steps ({steps * ms / 1e3:g} s) to {band}" for band, steps in bands.items() if steps is not None]
+    seen += [f"not to {band}" for band, steps in bands.items() if steps is None and seen]
+    yield "Settling", "; ".join(filter(None, (", ".join(seen), escape(first.reason))))
+    yield "Overshoot", "not known" if found.overshoot is None else f"{found.overshoot:.2%} of the initial error"
+    yield "Damping of the speed", found.damping or "the run cannot tell"
+    yield "Last excursion above 1 cm", _excursion(found.excursion)
+    yield "Error", _error(found)
+
+
+def _excursion(found: LastExcursion | None) -> str:
+    if found is None:
+        return "none"
+    cause = "of the initial error" if found.is_initial_error else "not after an outage"
+    if found.after is not None:
+        cause = f"after an outage of {found.after} slots"
+    when = f"{found.seconds:g} s" if found.is_over else f"lasts when the run ends, at {found.seconds:g} s"
+    return f"{when}, {cause}"
+
+
+def _error(found: Convergence) -> str:
+    """The error at the start apart from the largest one afterwards."""
+    said = [f"{found.position.initial:.3g} m at the start"]
+    later = found.max_error_after_settling
+    if later is None or (found.position.peak > later and found.position.peak > found.position.initial):
+        said.append(f"at most {found.position.peak:.3g} m")
+    if later is not None and found.initial.has_nothing_to_settle:
+        said.append(f"at most {later:.3g} m")
+    elif later is not None:
+        said.append(f"at most {later:.3g} m after settling")
+    return ", ".join([*said, f"{found.position.final:.3g} m at the end"])
 
 
 def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
@@ -143,10 +179,6 @@ def _judged(stable: bool | None, why: str) -> str:
     if stable is None:
         return f"[yellow]undecided[/] ({why})"
     return f"[green]stable[/] ({why})" if stable else f"[red]unstable[/] ({why})"
-
-
-def _steps(steps: int | None, ms: float) -> str:
-    return "never" if steps is None else f"{steps} steps ({steps * ms / 1e3:g} s)"
 
 
 def margin_rows(scenario: Scenario) -> Iterator[tuple[str, str]]:

@@ -7,7 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from agv_analysis.metrics.convergence import SHARE, settling, sign_changes
+from agv_analysis.metrics.bands import SHARE
+from agv_analysis.metrics.error_metrics import settling, sign_changes
 from agv_analysis.reproduce import constant_delay
 from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Claim, Judgement, Values, holds_if
 from agv_analysis.reproduce.runs import GAINS, LIMIT, Runs, gain, scenario

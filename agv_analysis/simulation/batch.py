@@ -18,10 +18,12 @@ from agv_analysis.compiled import numbers
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.simulation.decay import Decay, decay, decay_over_links
 from agv_analysis.simulation.link_loop import LinkTrace, contraction_over_links, empty_trace, statistics_over_links
 from agv_analysis.simulation.loop import (
+    Loop,
     RunInputs,
-    Statistics,
+    RunMetrics,
     statistics,
     statistics_of_twins,
     statistics_of_two,
@@ -32,12 +34,15 @@ from agv_analysis.simulation.single import settings_of, simulate, start_of, step
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
 from agv_ros.parts import PartError
+from agv_ros.pose import Pose
 from agv_ros.substitution import Replacements
 
+_FIRST, *_OTHERS = get_type_hints(RunMetrics).items()
 STATISTICS = np.dtype([
-    *((name, np.dtype(kind)) for name, kind in get_type_hints(Statistics).items()), ("contraction", np.dtype(float))
+    *((name, np.dtype(kind)) for name, kind in (_FIRST, *get_type_hints(Decay).items(), *_OTHERS)),
+    ("contraction", np.dtype(float)),
 ])  # fmt: skip
-"""One run's row: the fields of `loop.Statistics`, int64 and float64, and how far twins are apart in the end.
+"""One run's row: the fields of `loop.RunMetrics` and `decay.Decay`, and how far twins are apart in the end.
 
 `contraction` is that of `loop.statistics_of_twins`, NaN for a run without a twin.
 """
@@ -46,6 +51,8 @@ Table = NDArray[np.void]
 Realisations = Callable[[int, int, float], ChannelRealisation]
 Job = tuple[int, int]
 """One run: (row, column) of the table, that is, scenario and seed."""
+Result = tuple[Job, RunMetrics, Decay, float]
+"""What is known of a run: its metrics, what becomes of its initial error, how far twins are apart in the end."""
 
 TWIN_OFFSET = 1e-6
 """A twin begins this far from the run [m, m, rad]: far above rounding, far below what makes the loop nonlinear."""
@@ -119,8 +126,10 @@ class _Batch:
             parts = replacements_of(self._scenarios[row])
             of_kind = list(jobs)
             try:
-                for job, found, contraction in run(self._reference(row), of_kind, realisations, parts):
-                    self.table[job] = (*found, contraction)
+                for job, (steps, *metrics), of_start, contraction in run(
+                    self._reference(row), of_kind, realisations, parts
+                ):
+                    self.table[job] = (steps, *of_start, *metrics, contraction)
             except PartError as error:
                 raise PartError(self._where_it_fails(of_kind) or str(error)) from error
         return len(unit)
@@ -138,33 +147,46 @@ class _Batch:
 
     def _by_twos(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
-    ) -> Iterator[tuple[Job, Statistics, float]]:
+    ) -> Iterator[Result]:
         direct = [job for job in jobs if self._is_direct(job)]
         for job in jobs:
             if not self._is_direct(job):
-                yield job, self._over_links(reference, job, realisations, parts)[0], math.nan
+                yield job, *self._over_links(reference, job, realisations, parts)[:2], math.nan
         for one, other in zip_longest(direct[::2], direct[1::2]):
-            if other is None:
-                yield one, run_parts(statistics, parts, reference, self._inputs(one, realisations)), math.nan
-            else:
-                inputs = self._inputs(one, realisations), self._inputs(other, realisations)
-                found = run_parts(statistics_of_two, parts, reference, *inputs)
-                yield one, found[0], math.nan
-                yield other, found[1], math.nan
+            pair = [one] if other is None else [one, other]
+            inputs = [self._inputs(job, realisations) for job in pair]
+            found = (
+                [run_parts(statistics, parts, reference, *inputs)]
+                if other is None
+                else run_parts(statistics_of_two, parts, reference, *inputs)
+            )
+            for job, its, metrics in zip(pair, inputs, found, strict=True):
+                yield job, metrics, self._decay(reference, job, its, parts), math.nan
 
     def _with_twins(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
-    ) -> Iterator[tuple[Job, Statistics, float]]:
+    ) -> Iterator[Result]:
         for job in jobs:
             twin = start_of(self._scenarios[job[0]], TWIN_OFFSET)
+            inputs = self._inputs(job, realisations)
             if self._is_direct(job):
-                yield job, *run_parts(statistics_of_twins, parts, reference, self._inputs(job, realisations), twin)
+                found, contraction = run_parts(statistics_of_twins, parts, reference, inputs, twin)
+                yield job, found, self._decay(reference, job, inputs, parts), contraction
             else:
-                found, traces = self._over_links(reference, job, realisations, parts)
+                found, of_start, traces = self._over_links(reference, job, realisations, parts)
                 is_whole = found.steps == self._steps[job[0]]
-                inputs = self._inputs(job, realisations)
                 arguments = reference, inputs, twin, *traces
-                yield job, found, run_parts(contraction_over_links, parts, *arguments) if is_whole else math.inf
+                apart = run_parts(contraction_over_links, parts, *arguments) if is_whole else math.inf
+                yield job, found, of_start, apart
+
+    def _decay(self, reference: Floats, job: Job, inputs: RunInputs, parts: Replacements) -> Decay:
+        """What becomes of the initial error of a run whose messages arrive at once or not at all."""
+        found: Decay = run_parts(decay, parts, reference, inputs, self._on_reference(reference, job))
+        return found
+
+    def _on_reference(self, reference: Floats, job: Job) -> Loop:
+        """The loop before slot 0 with the AGV on its reference."""
+        return start_of(self._scenarios[job[0]], at=Pose(*(float(value) for value in reference[0][:3])))
 
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay
@@ -172,13 +194,16 @@ class _Batch:
 
     def _over_links(
         self, reference: Floats, job: Job, realisations: Realisations, parts: Replacements
-    ) -> tuple[Statistics, tuple[LinkTrace, LinkTrace]]:
-        """One run whose links have to be asked in the loop, and what became of its messages."""
+    ) -> tuple[RunMetrics, Decay, tuple[LinkTrace, LinkTrace]]:
+        """One run whose links have to be asked in the loop, its initial error, and what became of its messages."""
         realisation, inputs = self._realisation(job, realisations), self._inputs(job, realisations)
         relay, steps = self._scenarios[job[0]].relay, self._steps[job[0]]
         links = realisation.link_inputs(relay.uplink, "uplink"), realisation.link_inputs(relay.downlink, "downlink")
-        traces = empty_trace(steps), empty_trace(steps)
-        return run_parts(statistics_over_links, parts, reference, inputs, *links, *traces), traces
+        up, down = empty_trace(steps), empty_trace(steps)
+        found = run_parts(statistics_over_links, parts, reference, inputs, *links, up, down)
+        held = [numbers(trace.held[: found.steps]) for trace in (up, down)]
+        of_start = run_parts(decay_over_links, parts, reference, inputs, self._on_reference(reference, job), *held)
+        return found, of_start, (up, down)
 
     def _realisation(self, job: Job, realisations: Realisations) -> ChannelRealisation:
         row, column = job

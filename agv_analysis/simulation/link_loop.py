@@ -24,8 +24,8 @@ from agv_analysis.simulation.loop import (
     PlanState,
     Rows,
     RunInputs,
+    RunMetrics,
     Settings,
-    Statistics,
     are_finite,
     begin,
     compared_reference,
@@ -233,9 +233,9 @@ def history_over_links(
 
 def statistics_over_links(
     reference: Rows, inputs: RunInputs, up: LinkInputs, down: LinkInputs, up_trace: LinkTrace, down_trace: LinkTrace
-) -> Statistics:
+) -> RunMetrics:
     """One run of which only the metrics are kept, and the traces of its links."""
-    run, past = begin(reference, inputs), nothing_past(len(up_trace.held), inputs.start.edge.memory)
+    run, past = begin(inputs), nothing_past(len(up_trace.held), inputs.start.edge.memory)
     for k in range(len(up_trace.held)):
         send_pose(past, k, run.loop, inputs.noise, inputs.settings)
         taken = transmit(up, up_trace, k, past.values[k, 0], past.values[k, 1])
@@ -244,7 +244,7 @@ def statistics_over_links(
         run = update_metrics(run, k, reference_at(reference, k), loop, sent)
         if not run.goes_on:
             break
-    return end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
+    return end(run, inputs.settings.ts)
 
 
 def contraction_over_links(

@@ -20,7 +20,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.metrics.convergence import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_cloud.control.command import command
 from agv_cloud.control.command_plan import next_error
 from agv_cloud.reference.point import ReferencePoint
@@ -309,17 +308,14 @@ def history(reference: Rows, inputs: RunInputs, rows: NDArray[np.float64], n_ul:
     return len(inputs.lost)
 
 
-class Statistics(NamedTuple):
-    """Metrics of one run, as `convergence` and `outages` define them; unless they say otherwise, of y_r - y_c in `map`.
+class RunMetrics(NamedTuple):
+    """Metrics of one run as `convergence` and `outages` define them; unless they say otherwise, of y_r - y_c in `map`.
 
-    A settling that did not happen is -1, an overshoot that does not exist NaN.
+    What becomes of the initial error is told by `decay.decay`.
     """
 
     steps: int
     """Slots until the run ended: fewer than asked for if the loop diverged."""
-    settle_1cm_steps: int
-    settle_2pct_steps: int
-    overshoot: float
     iae: float
     ise: float
     peak: float
@@ -337,12 +333,7 @@ class MetricsAccumulator(NamedTuple):
     loop: Loop
     goes_on: bool
     steps: int
-    outside_1cm: int
-    """Last step outside the band, -1 if there was none."""
-    outside_2pct: int
-    band_2pct: float
-    lowest: float
-    highest: float
+    peak: float
     e: float
     iae: float
     ise: float
@@ -353,10 +344,9 @@ class MetricsAccumulator(NamedTuple):
     n_ul_sum: int
 
 
-def begin(reference: Rows, inputs: RunInputs) -> MetricsAccumulator:
+def begin(inputs: RunInputs) -> MetricsAccumulator:
     """A run before slot 0."""
-    band = SHARE * abs(reference[0][1] - inputs.start.motion.y)
-    return MetricsAccumulator(inputs.start, True, 0, -1, -1, band, math.inf, -math.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
+    return MetricsAccumulator(inputs.start, True, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
 def proceed(
@@ -377,11 +367,7 @@ def update_metrics(
         loop,
         goes_on(loop, sent),
         k + 1,
-        run.outside_1cm if size < TOLERANCE else k,
-        run.outside_2pct if size < run.band_2pct else k,
-        run.band_2pct,
-        min(run.lowest, e),
-        max(run.highest, e),
+        max(run.peak, size),
         e,
         run.iae + size,
         run.ise + e * e,
@@ -392,63 +378,47 @@ def update_metrics(
     )
 
 
-def end(run: MetricsAccumulator, initial: float, ts: float) -> Statistics:
-    """The metrics of a run of at least one slot, from the error [m] that it began with."""
-    started = abs(initial) > NEGLIGIBLE
-    beyond = -run.lowest if initial > 0.0 else run.highest
-    return Statistics(
-        run.steps,
-        run.outside_1cm + 1 if run.outside_1cm + 1 < run.steps else -1,
-        run.outside_2pct + 1 if started and run.outside_2pct + 1 < run.steps else -1,
-        max(0.0, beyond) / abs(initial) if started else math.nan,
-        run.iae * ts,
-        run.ise * ts,
-        max(-run.lowest, run.highest),
-        run.e,
-        math.sqrt(run.farthest),
-        math.sqrt(run.square),
-        run.n_ul_max,
-        run.n_ul_sum / run.steps,
-    )
+def end(run: MetricsAccumulator, ts: float) -> RunMetrics:
+    """The metrics of a run of at least one slot."""
+    return RunMetrics(
+        run.steps, run.iae * ts, run.ise * ts, run.peak, run.e, math.sqrt(run.farthest), math.sqrt(run.square),
+        run.n_ul_max, run.n_ul_sum / run.steps,
+    )  # fmt: skip
 
 
-def statistics(reference: Rows, inputs: RunInputs) -> Statistics:
+def statistics(reference: Rows, inputs: RunInputs) -> RunMetrics:
     """One run of which only the metrics are kept; `reference` as of `history`."""
-    run = begin(reference, inputs)
+    run = begin(inputs)
     for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
         run = proceed(run, k, now, compared_reference(now, reference, k, inputs.settings.ahead), inputs)
         if not run.goes_on:
             break
-    return end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
+    return end(run, inputs.settings.ts)
 
 
-def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[Statistics, Statistics]:
+def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[RunMetrics, RunMetrics]:
     """Two runs on one reference, as `statistics`; together they take little longer than one.
 
     Each step of a run waits for a sine from the step before; meanwhile the core works on the other run.
     """
-    first, second = begin(reference, one), begin(reference, other)
+    first, second = begin(one), begin(other)
     for k in range(len(one.lost)):
         now = reference_at(reference, k)
         if first.goes_on:
             first = proceed(first, k, now, compared_reference(now, reference, k, one.settings.ahead), one)
         if second.goes_on:
             second = proceed(second, k, now, compared_reference(now, reference, k, other.settings.ahead), other)
-    y_r = reference[0][1]
-    return (
-        end(first, y_r - one.start.motion.y, one.settings.ts),
-        end(second, y_r - other.start.motion.y, other.settings.ts),
-    )
+    return end(first, one.settings.ts), end(second, other.settings.ts)
 
 
-def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple[Statistics, float]:
+def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple[RunMetrics, float]:
     """A run as `statistics`, and how far a twin of it, begun elsewhere and with the same losses, is in the end.
 
     That is the distance of the two AGVs in (x, y, theta) [m, m, rad] as a multiple of what it was at the beginning: a
     loop that forgets where it began contracts it. inf if either diverges.
     """
-    run, begun, ends = begin(reference, inputs), twin, False
+    run, begun, ends = begin(inputs), twin, False
     for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
         compared = compared_reference(now, reference, k, inputs.settings.ahead)
@@ -458,7 +428,7 @@ def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple
             ends = not goes_on(twin, sent)
         if not run.goes_on:
             break
-    found = end(run, reference[0][1] - inputs.start.motion.y, inputs.settings.ts)
+    found = end(run, inputs.settings.ts)
     if ends or not run.goes_on:
         return found, math.inf
     return found, pose_distance(run.loop.motion, twin.motion) / pose_distance(inputs.start.motion, begun.motion)

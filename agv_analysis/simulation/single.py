@@ -24,6 +24,7 @@ from agv_plant.vehicle.motion import NOISE, SLIP, vehicle_parameters
 from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_ros.errors import UserError
 from agv_ros.parts import PartError
+from agv_ros.pose import Pose
 from agv_ros.substitution import Replacements
 
 _PAPERS_VEHICLE = vehicle_parameters(PlantParameters())
@@ -84,9 +85,9 @@ def _drive(
         raise PartError(f"{error}, at step {np.count_nonzero(np.isfinite(rows[:, 0])) - 1}") from error
 
 
-def start_of(scenario: Scenario, offset: float = 0.0) -> Loop:
-    """The loop of a scenario before slot 0, its AGV `offset` [m, m, rad] away from its initial pose."""
-    x, y, theta = (value + offset for value in scenario.plant.initial_pose)
+def start_of(scenario: Scenario, offset: float = 0.0, at: Pose | None = None) -> Loop:
+    """The loop of a scenario before slot 0, its AGV `offset` [m, m, rad] away from its initial pose, or from `at`."""
+    x, y, theta = (value + offset for value in (scenario.plant.initial_pose if at is None else at))
     vehicle, law = VEHICLES.find(scenario.plant.vehicle), CONTROL_LAWS.find(scenario.controller.law)
     return at_rest(x, y, theta, (0.0,) * len(vehicle.states), law.memory)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.run import Floats
 from agv_analysis.simulation.batch import Table
+from agv_analysis.simulation.decay import NOT_SETTLED
 from agv_analysis.stability.repeated_run import settles_without_losses
 from agv_analysis.sweep import METRICS
 from agv_analysis.sweep.plan import Sweep
@@ -45,18 +46,21 @@ def _row(sweep: Sweep, point: int, runs: Table) -> dict[str, Any]:
         "diverged": int(np.count_nonzero(np.isinf(runs["contraction"]))),
     }
     for metric in METRICS:
-        p50, p95 = quantiles(runs[metric].astype(np.float64), metric.startswith("settle"))
+        values = runs[metric].astype(np.float64)
+        if metric.startswith("settle"):  # of an AGV that begins on its reference there is nothing to settle
+            values[(values == NOT_SETTLED) & np.isnan(runs["overshoot"])] = math.nan
+        p50, p95 = quantiles(values, metric.startswith("settle"))
         row |= {f"{metric}_p50": p50, f"{metric}_p95": p95}
     return row | {"first_seed": sweep.seeds[0], "version": version()}
 
 
 def quantiles(values: Floats, settling: bool) -> tuple[float, float]:
-    """Median and 95th percentile, values that occurred; a settling that did not happen (-1) counts as inf.
+    """Median and 95th percentile, values that occurred; a settling that did not happen counts as inf.
 
-    NaN where a metric is not defined in every run.
+    NaN where a metric is not defined in every run, as the settling of an AGV that begins on its reference.
     """
     if settling:
-        values = np.where(values < 0.0, np.inf, values)
+        values = np.where(values == NOT_SETTLED, np.inf, values)
     if np.isnan(values).any():
         return math.nan, math.nan
     p50, p95 = np.percentile(values, [50.0, 95.0], method="inverted_cdf")
