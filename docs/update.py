@@ -47,9 +47,10 @@ def paper_page(out: str) -> str:
         "measured when the command runs, on the scenario of `config/paper.yaml` with the settings that the claim "
         "names; with `--ros` on recorded runs of the nodes. What no single run shows (twins, a pose that is always n "
         "steps old, scans of a gain) is simulated either way. The paper's text gives neither its track nor K_y and "
-        "K_theta: the scenario is a choice.\n\nThe error is `y_r - y_c`, settled when it stays below 1 cm. Twins are "
-        "two AGVs that begin a micrometre apart and meet the same losses; their number is their distance at the end as "
-        "a multiple of that at the beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8")
+        "K_theta: the scenario is a choice.\n\nAn error has settled when less than 1 cm is left of it, a command when "
+        "`v - v_r` stays within 2 % of its largest value. Steps count from k = 0. Twins are two AGVs that begin a "
+        "micrometre apart and meet the same losses; their number is their distance at the end as a multiple of that at "
+        "the beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8")
     )
 
 

@@ -10,6 +10,7 @@ from agv_analysis.reproduce.runs import Runs
 
 HOLDS = "holds"
 REMARK = "holds with a remark"
+PART = "holds in part"
 FAILS = "does not hold"
 
 Values = dict[str, Any]

@@ -164,8 +164,8 @@ def _single_bursts() -> list[Values]:
             row: Values = {"n": n, "speed": limit}
             for kx in GAINS:
                 found = convergence(simulate(scenario(*gain(kx, v_max), *outage, "plant.duration=10.0")))
-                row[f"K_x = {kx:g} [steps]"] = found.settle_2pct_steps
-                row[f"K_x = {kx:g} overshoot"] = found.overshoot
+                row[f"K_x = {kx:g} [steps]"] = found.y.settle_2pct_steps
+                row[f"K_x = {kx:g} overshoot"] = found.y.overshoot
             rows.append(row)
     return rows
 

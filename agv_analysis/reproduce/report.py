@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from agv_analysis.reproduce.claim import FAILS, HOLDS, REMARK, Finding, Values
+from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding, Values
 from agv_analysis.version import version
 from agv_ros.errors import UserError
 
 _ROUNDING = 1e-9
 """Below this a measured value differs between machines."""
 
-_COLOURS = {HOLDS: "green", REMARK: "yellow", FAILS: "red"}
+_COLOURS = {HOLDS: "green", REMARK: "yellow", PART: "yellow", FAILS: "red"}
 
 
 @dataclass(frozen=True)
