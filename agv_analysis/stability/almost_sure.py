@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli
 from agv_analysis.run import Floats
+from agv_analysis.stability.borders import crossing
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.mean_square import crossing
 from agv_analysis.stability.products import orthogonalised_pass
 from agv_analysis.stability.reception_maps import reception_maps
 from agv_plant.random_stream import uniforms

@@ -21,6 +21,7 @@ beginning), which costs the same for every n.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
+from agv_analysis.stability.borders import last_stable
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radius
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import growths, multiply
@@ -164,10 +166,16 @@ def _drive_predicted(
     return log_scale
 
 
-def largest_constant_delay(loop: LinearLoop, limit: int = 10_000) -> int | None:
-    """Largest constant n for which the lap contracts the error; -1 if not even 0 does, None if all up to `limit` do.
+def is_stable_with_delay(loop: LinearLoop, n: int) -> bool:
+    """Does a lap contract every small error if the pose is always `n` steps old?"""
+    return constant_delay(loop, n) < MARGINAL * loop.steps
 
-    The closed forms for a straight track at the mean speed say where to look, if there are any.
+
+def largest_constant_delay(loop: LinearLoop, limit: int = 10_000) -> int | None:
+    """Largest n up to which every constant delay lets the lap contract; -1: not even 0, None: all up to `limit` do.
+
+    The closed forms for a straight track at the mean speed say where to look, if there are any. Longer delays may be
+    stable again, see `borders.stable_again`.
     """
     guess = 0.0
     if not loop.predicts and loop.along_gain is not None:
@@ -175,26 +183,7 @@ def largest_constant_delay(loop: LinearLoop, limit: int = 10_000) -> int | None:
         if loop.closed_form is not None:
             mean = float(np.abs(loop.v_r).mean())
             guess = min(guess, critical_delay_across(mean, loop.closed_form, loop.ts))
-    return last_stable(lambda n: constant_delay(loop, n) < MARGINAL * loop.steps, guess, limit)
-
-
-def last_stable(is_stable: Callable[[int], bool], guess: float, limit: int) -> int | None:
-    """Largest n that is stable, searched for about a guess; -1: not even 0 is, None: all that was tried up to `limit`.
-
-    Taken for granted is that from the first n that is not stable on none is.
-    """
-    stable, step = math.ceil(guess) - 1, 1
-    while stable >= 0 and not is_stable(stable):
-        stable, step = max(-1, stable - step), 2 * step
-    unstable, step = stable + 1, 1
-    while is_stable(unstable):
-        if unstable >= limit:
-            return None
-        stable, unstable, step = unstable, min(unstable + step, limit), 2 * step
-    while unstable - stable > 1:
-        middle = (stable + unstable) // 2
-        stable, unstable = (middle, unstable) if is_stable(middle) else (stable, middle)
-    return stable
+    return last_stable(functools.cache(lambda n: is_stable_with_delay(loop, n)), guess, limit)
 
 
 def drop_sequence(loop: LinearLoop, lost: NDArray[np.bool_], count: int | None = None) -> Floats:

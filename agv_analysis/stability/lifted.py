@@ -13,6 +13,7 @@ import numpy as np
 
 from agv_analysis.run import Floats
 from agv_analysis.stability import floquet
+from agv_analysis.stability.borders import last_stable
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radii
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_cloud.parameters import ControllerParameters
@@ -33,7 +34,7 @@ def largest_radius(loop: LinearLoop, n: int) -> float:
 
 
 def largest_n(loop: LinearLoop, limit: int = 100_000) -> int | None:
-    """Largest constant n at which every speed of the lap, held for ever, is stable; -1: not even 0, None: over `limit`.
+    """Largest n up to which every speed of the lap, held for ever, is stable; -1: not even 0, None: over `limit`.
 
     The closed forms for a straight track say where to look, the spectral radius at the lap's speeds decides. Without a
     closed form the lap as a whole decides, as of `floquet.largest_constant_delay`.
@@ -42,7 +43,7 @@ def largest_n(loop: LinearLoop, limit: int = 100_000) -> int | None:
     if gains is None:
         return floquet.largest_constant_delay(loop, limit)
     v, w = distinct_speeds(loop.v_r, loop.w_r)
-    return floquet.last_stable(
+    return last_stable(
         lambda n: float(spectral_radii(n, v, w, gains, loop.ts).max()) < 1.0, min(critical_delay(loop), limit), limit
     )
 

@@ -17,7 +17,6 @@ length B at a loss rate pi: pi B < 1/a - 1/2.
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -27,6 +26,7 @@ import numpy as np
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.run import Floats
+from agv_analysis.stability.borders import borders
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import multiply
 
@@ -40,6 +40,18 @@ _STEPS = 2000
 
 MOST_LOST = 0.9999
 """Largest loss probability that is asked for behind a predictor, which may make any of them harmless."""
+
+LONGEST_BURST = 1e6
+"""Longest mean burst [steps] that is asked for."""
+
+_TRIED = 25
+"""Loss probabilities of the grid on which borders are searched for."""
+
+_SETTLED, _ROUGHLY = 1e-8, 1e-3
+"""Change of the growth from one lap to the next, relative where it is above 1, at which it counts as settled."""
+
+_DOUBTFUL = 0.1
+"""Growth over a lap below which a roughly settled one does not tell the sign."""
 
 
 def step_maps(loop: LinearLoop, k: int = 0) -> tuple[Floats, Floats]:
@@ -93,11 +105,11 @@ class Moments(NamedTuple):
         return float(sum(np.trace(part, axis1=1, axis2=2).sum() for part in (self.zz, self.hh)))
 
 
-def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None) -> float:
+def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, settled: float = _SETTLED) -> float:
     """Growth (logarithm) of the second moments over a lap.
 
     By driving laps until the growth settles; `moments` are those to begin with, and are left as they settled, which
-    makes the next call with a similar chain faster.
+    makes the next call with a similar chain faster. `settled`: as of `settled_growth`.
     """
     if loop.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
         chain, moments = bernoulli(0.0), None
@@ -105,7 +117,7 @@ def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None) -
         return loop.steps * math.log(spectral_radius(*step_maps(loop), chain))
     if moments is None:
         moments = Moments.unit(loop, len(chain.delivery))
-    return settled_growth(loop, moments, moments.size, _drive(loop, chain, moments))
+    return settled_growth(loop, moments, moments.size, _drive(loop, chain, moments), settled)
 
 
 def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:
@@ -119,11 +131,13 @@ def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], 
 
 
 def settled_growth(
-    loop: LinearLoop, moments: tuple[Floats, ...], size: Callable[[], float], drive: Callable[[int], float]
-) -> float:
+    loop: LinearLoop, moments: tuple[Floats, ...], size: Callable[[], float], drive: Callable[[int], float],
+    settled: float = _SETTLED,
+) -> float:  # fmt: skip
     """Growth (logarithm) of second moments over a lap, by driving laps until it settles; -inf if nothing is left.
 
     `drive` sends them through so many steps in place, to be multiplied by exp(what it returns); `size` is theirs.
+    Settled is a growth that changes by less than `settled` from one lap to the next, relative where it is above 1.
     """
     steps, growths = _STEPS if loop.is_constant else math.ceil(_STEPS / loop.steps) * loop.steps, [math.nan]
     for _ in range(_LAPS):
@@ -136,7 +150,7 @@ def settled_growth(
         for part in moments:
             part /= size_now
         growths.append(log_scale + math.log(size_now))
-        if abs(growths[-1] - growths[-2]) <= 1e-8 * max(1.0, abs(growths[-1])):
+        if abs(growths[-1] - growths[-2]) <= settled * max(1.0, abs(growths[-1])):
             return growths[-1] * (loop.steps / steps)
     return float(np.mean(growths[_LAPS // 2 :])) * (loop.steps / steps)  # without losses a complex pair never settles
 
@@ -243,72 +257,69 @@ def _symmetric_product(A: Floats, B: Floats, product: Floats, add: bool) -> None
             product[j, i] = value
 
 
-def critical_loss(loop: LinearLoop) -> float:
-    """Loss probability p* below which independent losses leave a lap mean-square stable; -1: unstable without any.
+def loss_borders(loop: LinearLoop) -> tuple[float, ...]:
+    """Probabilities of independent losses at which a lap turns mean-square unstable, stable again, and so on.
 
-    Behind a predictor 1 if they do at every p up to MOST_LOST.
+    (0.0,) if it is unstable without any. Behind a predictor, which may make any losses harmless, up to MOST_LOST.
     """
     moments = Moments.unit(loop, 1)
 
-    @functools.cache  # the ends of an interval are asked for again
-    def growth(p: float) -> float:
-        return lap_growth(loop, bernoulli(p), moments) - MARGINAL * loop.steps
+    def growth(p: float, settled: float) -> float:
+        found = lap_growth(loop, bernoulli(p), moments, settled) - MARGINAL * loop.steps
+        return max(found, -MARGINAL) if p == 1.0 else found  # nothing received: what is off stays off
 
-    if growth(0.0) >= 0.0:
-        return -1.0
-    if not loop.predicts:
-        return crossing(growth, 0.0, 1.0)
-    tried = (0.0, 0.5, 0.8, 0.9, 0.95, 0.99, 0.999, MOST_LOST)
-    for low, high in itertools.pairwise(tried):
-        if growth(high) >= 0.0:
-            return crossing(growth, low, high)
-    return 1.0
+    grid = np.append(1.0 - np.logspace(0.0, math.log10(1.0 - MOST_LOST), _TRIED), [] if loop.predicts else [1.0])
+    return borders(_sign_first(growth), grid.tolist())
+
+
+def _sign_first(growth: Callable[[float, float], float]) -> Callable[[float], float]:
+    """A growth over a lap that is settled only where its sign is in doubt; values are kept."""
+
+    @functools.cache
+    def found(x: float) -> float:
+        rough = growth(x, _ROUGHLY)
+        return rough if abs(rough) > _DOUBTFUL else growth(x, _SETTLED)
+
+    return found
+
+
+def critical_loss(loop: LinearLoop) -> float:
+    """Loss probability p* up to which independent losses leave a lap mean-square stable; -1: unstable without any.
+
+    1 if they do at every p that was tried. Larger ones may be stable again, see `loss_borders`.
+    """
+    found = loss_borders(loop)
+    return 1.0 if not found else found[0] or -1.0
+
+
+def burst_borders(loop: LinearLoop, loss_rate: float) -> tuple[float, ...]:
+    """Mean bursts [steps] of a Gilbert channel of this loss rate in (0, 1) at which a lap turns unstable, and back.
+
+    Beginning with the shortest possible if it is unstable with that. Up to 1e6, or eight times the first of them.
+    """
+    moments, shortest = Moments.unit(loop, 2), shortest_mean_burst(loss_rate)
+
+    def growth(burst: float, settled: float) -> float:
+        return lap_growth(loop, bursty(loss_rate, burst), moments, settled) - MARGINAL * loop.steps
+
+    signed, grid, end = _sign_first(growth), [shortest], LONGEST_BURST
+    while grid[-1] < end:
+        if end == LONGEST_BURST and signed(grid[-1]) >= 0.0:
+            end = min(end, 8.0 * grid[-1])
+        grid.append(1.5 * grid[-1])
+    return borders(signed, grid)
 
 
 def critical_burst(loop: LinearLoop, loss_rate: float) -> float:
-    """Mean burst B* [steps] below which a Gilbert channel of this loss rate in (0, 1) leaves a lap mean-square stable.
+    """Mean burst B* [steps] up to which a Gilbert channel of this loss rate in (0, 1) leaves a lap mean-square stable.
 
-    -1 if the shortest bursts possible are too long, inf if 1e6 steps are not.
+    -1 if the shortest bursts possible are too long, inf if 1e6 steps are not. Longer ones may be stable again, see
+    `burst_borders`.
     """
-    moments = Moments.unit(loop, 2)
-
-    @functools.cache
-    def growth(burst: float) -> float:
-        return lap_growth(loop, bursty(loss_rate, burst), moments) - MARGINAL * loop.steps
-
-    low, high = 0.0, shortest_mean_burst(loss_rate)
-    while growth(high) < 0.0:
-        low, high = high, 2.0 * high
-        if low > 1e6:
-            return math.inf
-    return crossing(growth, low, high) if low else -1.0
-
-
-def crossing(f: Callable[[float], float], low: float, high: float) -> float:
-    """Where a continuous function changes its sign between `low` and `high`, to 1e-9 (Chandrupatla, 1997).
-
-    Inverse quadratic interpolation where three points allow it, bisection elsewhere (Adv. Eng. Software 28, 145).
-    """
-    b, c, share = low, high, 0.5
-    fb, fc = f(b), f(c)
-    a, fa = c, fc
-    for _ in range(100):
-        x = b + share * (c - b)
-        fx = f(x)
-        if (fx > 0.0) == (fb > 0.0):
-            a, fa = b, fb
-        else:
-            a, fa, c, fc = c, fc, b, fb
-        b, fb = x, fx
-        if fb == 0.0 or abs(c - b) <= 1e-9 * max(1.0, abs(b)):
-            break
-        share = 0.5
-        if math.isfinite(fa) and math.isfinite(fc) and fa != fc and fa != fb:
-            along, across = (b - c) / (a - c), (fb - fc) / (fa - fc)
-            if across**2 < along and (1.0 - across) ** 2 < 1.0 - along:
-                share = fb / (fc - fb) * fa / (fc - fa) + (a - b) / (c - b) * fb / (fa - fb) * fc / (fa - fc)
-                share = min(0.999, max(1e-3, share))
-    return b if abs(fb) < abs(fc) else c
+    found = burst_borders(loop, loss_rate)
+    if not found:
+        return math.inf
+    return -1.0 if found[0] == shortest_mean_burst(loss_rate) else found[0]
 
 
 def critical_loss_along(a: float) -> float:

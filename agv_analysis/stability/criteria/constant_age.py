@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from agv_analysis.stability import floquet, lifted
+from agv_analysis.stability.borders import stable_again
 from agv_analysis.stability.criteria.criterion import (
     Criterion,
     Judgement,
@@ -44,13 +45,22 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     limit = 0 if loop.is_exact else LONGEST_PREDICTED if loop.predicts else LONGEST
     n = floquet.largest_constant_delay(loop, limit)
     if n is not None:
-        yield Margin(name, label, n, steps_text(n, loop.ts))
+        yield Margin(name, label, n, steps_text(n, loop.ts), _longer_delays(loop, n, limit))
     elif loop.is_exact:
         yield Margin(name, label, None, reason="no bound: an exact prediction is as good as a fresh pose")
     else:
         reason = f"no bound: the lap contracts for every n that was tried, up to {limit}"
         yield Margin(name, label, None, reason=reason)
     yield _delay(loop)
+
+
+def _longer_delays(loop: LinearLoop, n: int, limit: int) -> str:
+    """What must be said of delays beyond the largest up to which all are stable; empty if none is stable again."""
+    again = stable_again(lambda longer: floquet.is_stable_with_delay(loop, longer), n, limit) if n >= 0 else None
+    if again is None:
+        return ""
+    first, last = again
+    return f"not monotone: unstable from {n + 1} to {first - 1}, stable again from {first} to {last}"
 
 
 def _delay(loop: LinearLoop) -> Margin:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from agv_analysis.link.markov_channel import chain_of, renewal_chain
+from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import mean_square, mean_square_two_links
+from agv_analysis.stability.borders import not_monotone
 from agv_analysis.stability.criteria.criterion import (
     Border,
     Criterion,
@@ -50,14 +51,14 @@ def _judge(facts: RunFacts) -> Judgement | None:
 
 def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     name, label = "p_max.mean_square", "Independent losses, mean square"
-    p = mean_square.critical_loss(facts.loop)
-    if p < 0.0:
-        yield Margin(name, label, None, reason=NOT_MET)
-    elif p > mean_square.MOST_LOST:
+    found = mean_square.loss_borders(facts.loop)
+    if not found:
         reason = f"no bound: the mean square dies out at every loss probability up to {mean_square.MOST_LOST}"
         yield Margin(name, label, None, reason=reason)
+    elif found[0] == 0.0:
+        yield Margin(name, label, None, reason=NOT_MET)
     else:
-        yield Margin(name, label, p, f"below {p:.5g}")
+        yield Margin(name, label, found[0], f"below {found[0]:.5g}", not_monotone(found, 5))
     yield _burst(facts)
 
 
@@ -73,14 +74,14 @@ def _burst(facts: ScenarioFacts) -> Margin:
     if not 0.0 < rate < 1.0:
         reason = f"no answer: the scenario's uplink loses {'nothing' if rate == 0.0 else 'everything'}"
         return Margin(name, label, None, reason=reason, extra=extra)
-    found = mean_square.critical_burst(facts.loop, rate)
-    if math.isinf(found):
+    found = mean_square.burst_borders(facts.loop, rate)
+    if not found:
         reason = "no bound: bursts of a million slots on average are not too long"
         return Margin(name, label, None, reason=reason, extra=extra)
-    if found < 0.0:
+    if found[0] == shortest_mean_burst(rate):
         reason = "not met: at this loss rate no burst is short enough"
         return Margin(name, label, None, reason=reason, extra=extra)
-    return Margin(name, label, found, f"{found:.4g} slots on average", extra=extra)
+    return Margin(name, label, found[0], f"{found[0]:.4g} slots on average", not_monotone(found, 4), extra)
 
 
 def _at_once(facts: RunFacts) -> Iterable[Row]:

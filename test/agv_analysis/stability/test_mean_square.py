@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_elliott
+from agv_analysis.stability.borders import crossing
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.mean_square import (
     along_spectral_radius,
@@ -21,7 +22,6 @@ from agv_analysis.stability.mean_square import (
     critical_loss,
     critical_loss_along,
     critical_mean_age_along,
-    crossing,
     lap_growth,
     operator,
     spectral_radius,
