@@ -24,7 +24,7 @@ from agv_analysis.run import Floats
 from agv_cloud.parameters import ControllerParameters
 
 
-def plant_matrices(v_r: Floats, w_r: Floats, ts: float) -> tuple[Floats, Floats]:
+def plant_matrices(v_r: Floats, w_r: Floats, ts: float | Floats) -> tuple[Floats, Floats]:
     """A and B at the speeds v_r [m/s], w_r [rad/s] of shape (N,); shapes (N, 3, 3) and (N, 3, 2)."""
     phi = ts * w_r
     cos, sin, zero, one = np.cos(phi), np.sin(phi), np.zeros(len(v_r)), np.ones(len(v_r))

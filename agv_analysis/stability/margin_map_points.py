@@ -1,7 +1,8 @@
 """Loops at constant speed with a closed form, and how much each of many of them can take.
 
-On a straight track margins are closed forms. On a curve the largest constant delay comes from the spectral radius of
-the lifted system, by bisection of all points at once.
+On a straight track margins are closed forms. On a curve, of all points at once, the largest constant delay comes from
+the spectral radius of the lifted system, by bisection, and the largest repeated burst from the maps between receptions
+M_(L+1) = F M_L + G, one burst length after the other.
 """
 
 from __future__ import annotations
@@ -13,13 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.run import Floats
 from agv_analysis.stability.joint_spectral_radius import largest_n_across, largest_n_along
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, radii_of
+from agv_analysis.stability.linearisation import step_matrices
 
 Ints = NDArray[np.int64]
 
 LIMIT = 100_000
 """Largest n that is looked for; a loop that is stable with it is listed with this number."""
+
+LONGEST = 1000
+"""Longest repeated bursts [slots] that are tried on a curve."""
 
 
 class Point(NamedTuple):
@@ -54,8 +60,39 @@ def largest_repeated_burst(point: Point) -> int:
 
 
 def largest_repeated_bursts(points: Sequence[Point]) -> Ints:
-    """`largest_repeated_burst` of each point, shape (points,)."""
-    return np.array([largest_repeated_burst(point) for point in points], dtype=np.int64)
+    """Largest n up to which bursts of n losses, again and again, contract at each point, shape (points,)."""
+    n = np.array([largest_repeated_burst(point) for point in points], dtype=np.int64)
+    curved = np.flatnonzero([point.ts * point.v * point.curvature != 0.0 for point in points])
+    n[curved] = _first_refuted([points[i] for i in curved]) - 1
+    return n
+
+
+def _first_refuted(points: Sequence[Point]) -> Ints:
+    """Smallest n whose repetition does not die out at each point, LIMIT + 1 where none up to LONGEST does so."""
+    found, going = np.full(len(points), LIMIT + 1), np.arange(len(points))
+    if not len(points):
+        return found
+    at: Any = Point(*np.array(points).T)  # each field an array
+    F, G = step_matrices(at.v, at.v * at.curvature, at, at.ts)
+    M = F + G
+    for n in range(LONGEST + 1):
+        refuted = ~_are_inside(M)
+        found[going[refuted]] = n
+        going, F, G, M = going[~refuted], F[~refuted], G[~refuted], M[~refuted]
+        if not len(going):
+            break
+        M = F @ M + G
+    return found
+
+
+def _are_inside(M: Floats) -> NDArray[np.bool_]:
+    """Are all eigenvalues of each matrix, shape (points, 3, 3), inside the unit circle?
+
+    By Jury's test of z^3 + a z^2 + b z + c (Theory and Application of the z-Transform Method, 1964).
+    """
+    trace, c = np.trace(M, axis1=1, axis2=2), -np.linalg.det(M)
+    a, b = -trace, 0.5 * (trace**2 - np.trace(M @ M, axis1=1, axis2=2))
+    return np.asarray((np.abs(c) < 1.0) & (np.abs(a + c) < 1.0 + b) & (np.abs(b - a * c) < 1.0 - c * c))
 
 
 def largest_delays(points: Sequence[Point]) -> Ints:

@@ -121,5 +121,5 @@ CRITERION = Criterion(
     margins=_margins,
     margin_names=(("n_max.bursts", "Any outages up to n"),),
     at_once=_at_once,
-    map_column=MapColumn("n_bursts", "largest repeated burst n (straight track)", largest_repeated_bursts, _of_loop),
+    map_column=MapColumn("n_bursts", "largest repeated burst n", largest_repeated_bursts, _of_loop),
 )

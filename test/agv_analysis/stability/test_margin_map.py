@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.scenario import load_scenario
+from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.almost_sure import exponent_along
 from agv_analysis.stability.gains import (
     best_almost_surely,
@@ -21,8 +22,16 @@ from agv_analysis.stability.gains import (
     best_in_mean_square,
     best_kx,
 )
+from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.margin_map import margin_map
-from agv_analysis.stability.margin_map_points import Point, largest_delays, largest_repeated_burst
+from agv_analysis.stability.margin_map_points import (
+    LIMIT,
+    Point,
+    largest_delays,
+    largest_repeated_burst,
+    largest_repeated_bursts,
+)
+from agv_cloud.parameters import ControllerParameters
 from agv_ros.errors import UserError
 
 REPOSITORY = Path(__file__).parents[3]
@@ -89,6 +98,24 @@ def test_repeated_bursts_on_both_sides_of_the_border() -> None:
             assert burst_radius(point, shorter) < 1.0
         if n < 60:
             assert burst_radius(point, n + 1) > 1.0 - 1e-9
+
+
+def test_repeated_bursts_on_curves_are_those_of_the_loop() -> None:
+    """By bursts driven step by step, and by the linear loop of the same point."""
+    random = np.random.default_rng(6)
+    points = [point_at_random(random)._replace(curvature=float(random.uniform(-3.0, 3.0))) for _ in range(60)]
+    points += [CANONICAL._replace(kx=5.0, curvature=curvature) for curvature in (0.0, 0.5, 2.0)]
+    found = largest_repeated_bursts(points).tolist()
+    for point, n in zip(points, found, strict=True):
+        if n < 100:
+            assert all(burst_radius(point, shorter) < 1.0 for shorter in range(n + 1))
+            assert burst_radius(point, n + 1) > 1.0 - 1e-9
+        gains = ControllerParameters(kx=point.kx, ky=point.ky, ktheta=point.ktheta)
+        loop = kanayama_loop(np.array([point.v]), np.array([point.v * point.curvature]), gains, point.ts)
+        refuted = joint_spectral_radius.first_refuted(loop, 1000)
+        assert n == LIMIT if refuted is None else n == refuted - 1
+    assert found[-3] == 78
+    assert found[-1] < 78
 
 
 def test_degenerate_points() -> None:
