@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,7 @@ from agv_analysis.commands import with_settings, write_json
 if TYPE_CHECKING:
     from agv_analysis.scenario import Scenario
     from agv_analysis.stability.empirical import Twins
+    from agv_analysis.stability.gains import GainChoice
 
 
 _POLICIES = {
@@ -74,6 +75,7 @@ def command(
         found = margins(scenario)
         twins, seeds = _twins(scenario)
         verdict = decide(evidence_of_scenario(scenario, twins))
+        found = dataclasses.replace(found, twins=twins)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
@@ -84,12 +86,11 @@ def command(
     for name, value in (*found.rows(), ("Twins of this scenario, simulated", _told(twins, seeds))):
         table.add_row(name, escape(value))
     console.print(table)
-    best, reasons = _best_gains(scenario)
-    for objective, kx in best.items():
-        reason = f" ({reasons[objective]})" if objective in reasons else ""
-        console.print(f"Best K_x, {objective.replace('_', ' ')}: {kx:.4g} 1/s{reason}")
+    best, why_no_gain = _best_gains(scenario)
+    for objective, choice in best.items():
+        console.print(f"Best K_x, {objective.replace('_', ' ')}: {escape(choice.words)}")
     if not best:
-        console.print(f"Best K_x: {reasons['best_kx']}")
+        console.print(f"Best K_x: {why_no_gain}")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     if found.infeasible:
@@ -99,10 +100,8 @@ def command(
     if found.left_out:
         console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
-        notes = {f"{name}_reason": reason for name, reason in reasons.items()}
-        gains = {"best_kx": {**best, **notes}} if best else {"best_kx": None, **notes}
         said = {"verdict": verdict.word, "verdict_criterion": verdict.criterion, "verdict_reason": verdict.reason}
-        write_json(json_file, {**said, **found.to_json(), "empirical": twins.to_json(), **gains})
+        write_json(json_file, {**said, **found.to_json(), **_gains_to_json(best, why_no_gain)})
 
 
 def _twins(scenario: Scenario) -> tuple[Twins, range]:
@@ -116,34 +115,48 @@ def _twins(scenario: Scenario) -> tuple[Twins, range]:
 
 def _told(twins: Twins, seeds: range) -> str:
     """What twins did, in words."""
+    if twins.different == 1 < len(seeds):
+        word = f"contracts to {twins.median:.2g}" if twins.contracting else "does not contract"
+        return f"1 run, which {word}: the seeds {seeds[0]} to {seeds[-1]} all give the same"
     runs = f"{twins.contracting} of {len(seeds)} runs contract (seeds {seeds[0]} to {seeds[-1]})"
     return f"{runs}, the median to {twins.median:.2g}" if math.isfinite(twins.median) else f"{runs}; the others diverge"
 
 
-def _best_gains(scenario: Scenario) -> tuple[dict[str, float], dict[str, str]]:
-    """Best K_x by objective under the scenario's uplink, and what is to be said of them, by objective.
+def _best_gains(scenario: Scenario) -> tuple[dict[str, GainChoice], str]:
+    """Best K_x by objective under the scenario's uplink, and why there is none.
 
-    None behind a predictor, for a channel that is no Markov chain or loses all; the reason is that of `best_kx`.
+    None behind a predictor, for another law, for a channel that is no Markov chain or loses all.
     """
     from agv_analysis.link.markov_channel import chain_of
-    from agv_analysis.stability.gains import WHY_A_TOLERANCE, best_kx
-    from agv_analysis.stability.scenario_loop import straight_loop_of
-    from agv_cloud.control.registry import KANAYAMA
+    from agv_analysis.stability.derived_loop import is_kanayamas_law
+    from agv_analysis.stability.gains import best_kx
+    from agv_analysis.stability.scenario_loop import lap_of, straight_loop_of
 
     chain, model = chain_of(scenario.relay.uplink), scenario.relay.uplink.model
     if scenario.error_detector.policy == "predict":
-        return {}, {"best_kx": "no answer: computed for a pose that is held, not for one that is predicted"}
+        return {}, "no answer: computed for a pose that is held, not for one that is predicted"
     if chain is None:
-        return {}, {"best_kx": f"no answer: the channel {model} is no finite Markov chain"}
+        changes = "is changed by its schedule" if scenario.relay.uplink.schedule else "is no finite Markov chain"
+        return {}, f"no answer: the channel {model} {changes}"
     if chain.loss_rate >= 1.0:
-        return {}, {"best_kx": "no answer: the scenario's uplink loses everything"}
+        return {}, "no answer: the scenario's uplink loses everything"
     # With a gain of 1 the loop's a is how far a commanded speed of 1 m/s moves the AGV in a step.
     unit = dataclasses.replace(scenario, controller=dataclasses.replace(scenario.controller, kx=1.0))
-    loop = straight_loop_of(unit) if scenario.controller.law == KANAYAMA else None
+    loop = straight_loop_of(unit) if is_kanayamas_law(scenario) else None
     advance = None if loop is None else loop.along_gain
     if advance is None or advance <= 0.0:
-        return {}, {"best_kx": "no answer: computed for Kanayama's law and a drive that obeys at once"}
-    return best_kx(chain, advance), {"almost_sure": WHY_A_TOLERANCE}
+        return {}, "no answer: computed for Kanayama's law and a drive that obeys at once"
+    return best_kx(chain, advance, len(lap_of(scenario))), ""
+
+
+def _gains_to_json(best: dict[str, GainChoice], why_no_gain: str) -> dict[str, Any]:
+    """The best gains by objective, what each costs, and the reasons."""
+    if not best:
+        return {"best_kx": None, "best_kx_reason": why_no_gain}
+    gains = {objective: choice.kx for objective, choice in best.items()}
+    reasons = {f"{objective}_reason": choice.reason for objective, choice in best.items() if choice.reason}
+    costs = {objective: choice.to_json() for objective, choice in best.items()}
+    return {"best_kx": {**gains, **reasons}, "best_kx_costs": costs}
 
 
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:

@@ -91,20 +91,30 @@ def _agrees_with_closed_form(scenario: Scenario, v: Floats, w: Floats) -> bool:
     rows = np.repeat(model.start(v, w)[None], len(v), axis=0)
     found = model.derivatives(rows, v, w)
     A, B = plant_matrices(v, w, scenario.plant.ts)
-    L_h = command_matrices(v, scenario.controller)
     derived = [
         (found.plant_of_state[:, :ERRORS, :ERRORS], A),
         (found.plant_of_command[:, :ERRORS], B),
-        (found.command_of_error, L_h),
         (found.following[:, :ERRORS], np.zeros((len(v), ERRORS))),
         (found.plant_of_state[:, :ERRORS, ERRORS:], np.zeros((len(v), ERRORS, model.size - ERRORS))),
     ]
+    if not _commands_as_kanayama(found, scenario, v, w):
+        return False
     policy = _policy_derivatives(scenario, model, rows, found.command, v, w)
     if (policy is not None) != (scenario.error_detector.policy == "predict"):
         return False
     if policy is not None:
         derived += [(policy[0], A), (policy[1], B)]
-    return all(np.allclose(one, other, rtol=1e-9, atol=1e-9) for one, other in derived)
+    return all(_is_close(one, other) for one, other in derived)
+
+
+def _is_close(one: Floats, other: Floats) -> bool:
+    return bool(np.allclose(one, other, rtol=1e-9, atol=1e-9))
+
+
+def _commands_as_kanayama(found: StepDerivatives, scenario: Scenario, v: Floats, w: Floats) -> bool:
+    """Are the commands at zero error those of the reference, shape (N,), and their derivatives those of the theory?"""
+    L_h = command_matrices(v, scenario.controller)
+    return _is_close(found.command, np.column_stack((v, w))) and _is_close(found.command_of_error, L_h)
 
 
 def is_kanayamas_law(scenario: Scenario) -> bool:
@@ -112,9 +122,7 @@ def is_kanayamas_law(scenario: Scenario) -> bool:
     if scenario.controller.law != KANAYAMA:
         return False
     model, v = model_of(scenario), np.array([min(1.0, 0.5 * scenario.controller.v_max)])
-    found = model.derivatives(model.start(v, v)[None], v, v)
-    L_h = command_matrices(v, scenario.controller)
-    return bool(np.allclose(found.command_of_error, L_h, rtol=1e-9) and np.allclose(found.command, v[0], rtol=1e-9))
+    return _commands_as_kanayama(model.derivatives(model.start(v, v)[None], v, v), scenario, v, v)
 
 
 def _assembled(

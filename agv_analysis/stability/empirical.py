@@ -17,6 +17,7 @@ import numpy as np
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate_batch
+from agv_analysis.simulation.single import steps_of
 from agv_cloud.reference.reference import lap_steps
 from agv_ros.errors import UserError
 
@@ -27,11 +28,20 @@ class Twins:
 
     contraction: Floats
     """One value a run, shape (runs,); inf if the loop left the range of numbers."""
+    different: int | None = None
+    """How many of the runs differ from each other: 1 where nothing depends on the seed. None: unknown."""
+    steps: int | None = None
+    """Length of a run [steps], if it is known."""
 
     @property
     def contracting(self) -> int:
         """Number of runs whose twins ended closer to each other than they began."""
         return int(np.count_nonzero(self.contraction < 1.0))
+
+    @property
+    def mostly_contracting(self) -> bool:
+        """Do nine in ten runs contract?"""
+        return self.contracting >= 0.9 * len(self.contraction)
 
     @property
     def median(self) -> float:
@@ -57,7 +67,8 @@ def simulated_twins(scenario: Scenario, seeds: Sequence[int]) -> Twins:
 
     A contraction of 1e-9 or so is rounding: they have met. Raises UserError if the run has no end.
     """
-    return Twins(simulate_batch([scenario], seeds, twins=True)["contraction"][0])
+    runs = simulate_batch([scenario], seeds, twins=True)[0]
+    return Twins(runs["contraction"], len({run.tobytes() for run in runs}), steps_of(scenario))
 
 
 def distances(run: Run, twin: Run) -> Floats:

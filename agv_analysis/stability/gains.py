@@ -17,16 +17,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats
+from agv_analysis.stability.joint_spectral_radius import largest_n_along
 from agv_analysis.stability.mean_square import along_spectral_radius
 
 TOLERANCE = 0.1
 """Relative tolerance of a gain that is meant to be best almost surely."""
+
+RARE = 0.05
+"""Probability of a longer outage in a run at which the longest that a gain is to survive is chosen."""
 
 WHY_A_TOLERANCE = (
     f"averaged over gains within {TOLERANCE:.0%}: at a gain where 1 / (T_s K_x) is an integer the exponent itself is "
@@ -78,20 +83,85 @@ def _antiderivative(u: Floats) -> Floats:
     return np.asarray(u * np.log(np.abs(u), where=u != 0.0, out=np.zeros_like(u)) - u)
 
 
-def best_kx(chain: Chain, advance: float) -> dict[str, float]:
-    """Best K_x [1/s] by objective under a channel; delay and bursts for its mean burst, rounded up.
+@dataclass(frozen=True)
+class GainChoice:
+    """A gain that is best by one objective, and what it costs under the others, along a straight track."""
+
+    kx: float | None
+    """[1/s]; None where the objective has no answer."""
+    reason: str = ""
+    """Why there is none, or what must be known of it."""
+    growth: float = math.nan
+    """Growth (logarithm, per step) of E[e^2] under the channel."""
+    survives: int = -1
+    """Longest outages [slots] that it survives in any order, -1: not even none."""
+
+    @property
+    def is_usable(self) -> bool:
+        """Does the mean square die out under the channel?"""
+        return self.growth < 0.0
+
+    @property
+    def words(self) -> str:
+        """Gain and costs in words."""
+        if self.kx is None:
+            return self.reason
+        square = "dies out" if self.is_usable else "grows"
+        costs = f"E[e^2] {square}, times {math.exp(self.growth):.4g} a step; survives outages of up to {self.survives}"
+        refused = "" if self.is_usable else "not recommended: "
+        return f"{self.kx:.4g} 1/s ({refused}{f'{self.reason}; ' if self.reason else ''}{costs})"
+
+    def to_json(self) -> dict[str, float | int | bool | None]:
+        """The costs by name."""
+        found = self.kx is not None
+        return {
+            "mean_square_growth": self.growth if math.isfinite(self.growth) else None,
+            "mean_square_stable": self.is_usable if found else None,
+            "survives_outages_of": self.survives if found else None,
+            "recommended": found and self.is_usable,
+        }
+
+
+def longest_expected_outage(chain: Chain, slots: int) -> int | None:
+    """Outage [slots] that is exceeded in `slots` slots with a probability of at most RARE or so; 0 without losses.
+
+    By the expected number of longer ones. None if it is over a million.
+    """
+    lengths = chain.burst_lengths()
+    receptions = slots / float(lengths @ np.arange(1, len(lengths) + 1))
+    longer = receptions * (np.append(np.cumsum(lengths[::-1])[::-1], 0.0))  # of L >= 1, 2, ...
+    rare = np.flatnonzero(longer <= RARE)
+    return None if len(lengths) >= 1_000_000 or not len(rare) else int(rare[0]) - 1
+
+
+def best_kx(chain: Chain, advance: float, slots: int) -> dict[str, GainChoice]:
+    """Best K_x by objective under a channel, and what each costs.
 
     `advance` [s] is how far a commanded speed of 1 m/s moves the AGV along the track in a step: T_s if it is obeyed.
+    Delay: of the mean outage, rounded up. Bursts: of the longest outage to be expected in `slots` slots.
     """
-    n = math.ceil(chain.mean_burst - 1e-9)
+    mean, longest = math.ceil(chain.mean_burst - 1e-9), longest_expected_outage(chain, slots)
+    nothing = "no answer: the scenario's uplink loses nothing, so no outage is to be survived"
+
+    def choice(a: float, reason: str = "") -> GainChoice:
+        survives = largest_n_along(a)
+        radius = along_spectral_radius(a, chain)
+        growth = math.log(radius) if radius > 1e-12 else -math.inf  # deadbeat: rounding is left
+        return GainChoice(a / advance, reason, growth, -1 if survives is None else survives)
+
     best = {
-        "no_outages": 1.0,
-        "delay": best_for_delay(n),
-        "bursts": best_for_bursts(n)[0],
-        "mean_square": best_in_mean_square(chain)[0],
-        "almost_sure": best_almost_surely(chain)[0],
+        "no_outages": choice(1.0, "deadbeat"),
+        "delay": choice(best_for_delay(mean), f"each pose {mean} steps old") if mean else GainChoice(None, nothing),
+        "bursts": GainChoice(None, nothing),
+        "mean_square": choice(best_in_mean_square(chain)[0]),
+        "almost_sure": choice(best_almost_surely(chain)[0], WHY_A_TOLERANCE),
     }
-    return {objective: a / advance for objective, a in best.items()}
+    if longest is None:
+        best["bursts"] = GainChoice(None, "no answer: outages of the scenario's uplink may last over a million slots")
+    elif longest > 0:
+        reason = f"for outages of up to {longest} slots; longer ones come in less than 5 % of runs of {slots} slots"
+        best["bursts"] = choice(best_for_bursts(longest)[0], reason)
+    return best
 
 
 def minimum(f: Callable[[float], float], low: float, high: float) -> tuple[float, float]:

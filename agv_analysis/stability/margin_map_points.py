@@ -63,7 +63,7 @@ def largest_repeated_bursts(points: Sequence[Point]) -> Ints:
     """Largest n up to which bursts of n losses, again and again, contract at each point, shape (points,)."""
     n = np.array([largest_repeated_burst(point) for point in points], dtype=np.int64)
     curved = np.flatnonzero([point.ts * point.v * point.curvature != 0.0 for point in points])
-    n[curved] = _first_refuted([points[i] for i in curved]) - 1
+    n[curved] = _first_refuted([points[i] for i in curved.tolist()]) - 1
     return n
 
 

@@ -9,9 +9,16 @@ from typing import Any
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts
+from agv_analysis.stability.empirical import Twins
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_plant.parameters import ChannelParameters, PlantParameters
 from agv_ros.parameters import as_dict
+
+GROWTH = ".mean_square_growth"
+"""End of the names of margins that are the growth of E[e^2] with the links as they are."""
+
+_PLAIN = 10.0
+"""How much E[e^2] must die out over a run (logarithm) for twins that do not contract to speak against it."""
 
 _UNKNOWN_TO_CRITERIA = ("noise_xy", "noise_theta", "slip_noise")
 """Parameters of the plant that no criterion but the empirical one knows."""
@@ -32,6 +39,8 @@ class Margins:
     """What must be known of the motion about which the loop was linearised: limits that are active on it."""
     left_out: tuple[str, ...] = ()
     """What the scenario has and these margins do not know."""
+    twins: Twins | None = None
+    """Simulated twins of the very scenario, where there are any."""
 
     def __getitem__(self, name: str) -> Any:
         """The value of a margin."""
@@ -134,7 +143,27 @@ class Margins:
                 f"between {p_square:.4f} and {p_sure:.4f} of independent losses almost every run "
                 "converges, but the mean square of the error grows: rare long outages dominate it"
             )
-        return found
+        return [*found, *self._against_twins()]
+
+    def _against_twins(self) -> Iterator[str]:
+        """A sentence if simulated twins of this very scenario do not contract although E[e^2] dies out under it."""
+        growing = [
+            margin.value for name, margin in self.found.items() if name.endswith(GROWTH) and margin.value is not None
+        ]
+        if self.twins is None or not growing or self.twins.mostly_contracting:
+            return
+        if max(growing) * (self.twins.steps or 1) > -_PLAIN:
+            return  # too short a run for E[e^2] to die out
+        yield (
+            "with the links as they are a small error dies out in mean square, but of the scenario's simulated twins "
+            f"{self.twins.contracting} of {len(self.twins.contraction)} contract: far from its reference the loop is "
+            "not the linear one"
+        )
+
+    def _twins_to_json(self) -> dict[str, Any]:
+        if self.twins is None:
+            return {}
+        return {"empirical": {**self.twins.to_json(), "different_runs": self.twins.different}}
 
     @property
     def _paper_has_no_bound(self) -> bool:
@@ -162,6 +191,7 @@ class Margins:
             "notes": list(self.notes),
             "left_out": list(self.left_out),
             "disagreements": self.disagreements(),
+            **self._twins_to_json(),
         }
 
 

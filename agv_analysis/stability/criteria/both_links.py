@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 
 from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.stability import mean_square_two_links
-from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts
+from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts, finite, growth_text
 
 
 def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
@@ -27,8 +26,7 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
         return
     links = mean_square_two_links.correlated(uplink, downlink, relay.downlink.correlation)
     growth = mean_square_two_links.lap_growth(facts.loop, links, policy == "zero") / facts.loop.steps
-    word = "dies out" if growth < 0.0 else "grows"
-    yield Margin(name, label, growth, f"E[e^2] {word}, times {math.exp(growth):.6g} a step")
+    yield Margin(name, label, finite(growth), growth_text(growth))
 
 
 CRITERION = Criterion(

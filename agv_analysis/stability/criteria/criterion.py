@@ -7,6 +7,7 @@ run or of a scenario, each computed once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -202,3 +203,8 @@ def finite(value: float) -> float | None:
 def steps_text(n: int, ts: float) -> str:
     """A number of steps that a scenario can take, with its time."""
     return "does not contract even without outages" if n < 0 else f"{n} steps ({n * ts * 1e3:g} ms)"
+
+
+def growth_text(growth: float) -> str:
+    """What becomes of the mean square with this growth (logarithm, per step)."""
+    return f"E[e^2] {'dies out' if growth < 0.0 else 'grows'}, times {math.exp(growth):.6g} a step"

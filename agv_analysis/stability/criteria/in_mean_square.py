@@ -18,6 +18,7 @@ from agv_analysis.stability.criteria.criterion import (
     RunFacts,
     ScenarioFacts,
     finite,
+    growth_text,
 )
 from agv_analysis.stability.scenario_loop import straight_loop_of
 
@@ -60,6 +61,19 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     else:
         yield Margin(name, label, found[0], f"below {found[0]:.5g}", not_monotone(found, 5))
     yield _burst(facts)
+    yield _as_it_is(facts)
+
+
+def _as_it_is(facts: ScenarioFacts) -> Margin:
+    """Growth of E[e^2] under the scenario's uplink."""
+    name, label, uplink = "uplink.mean_square_growth", "Uplink as it is, mean square", facts.scenario.relay.uplink
+    chain = chain_of(uplink)
+    if chain is None:
+        return Margin(name, label, None, reason=f"no answer: the channel {uplink.model} is no finite Markov chain")
+    if uplink.delays:
+        return Margin(name, label, None, reason="no answer: poses are late as well", shown=False)
+    growth = mean_square.lap_growth(facts.loop, chain) / facts.loop.steps
+    return Margin(name, label, finite(growth), growth_text(growth))
 
 
 def _burst(facts: ScenarioFacts) -> Margin:
@@ -111,6 +125,7 @@ CRITERION = Criterion(
     margin_names=(
         ("p_max.mean_square", "Independent losses, mean square"),
         ("burst_max.mean_square", "Bursts, mean square"),
+        ("uplink.mean_square_growth", "Uplink as it is, mean square"),
     ),
     at_once=_at_once,
     border=Border("mean square", _border),

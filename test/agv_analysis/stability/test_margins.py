@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import pytest
 
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.criteria.any_outages import binding
+from agv_analysis.stability.empirical import Twins
 from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.margins import Margins, margins
 from agv_cloud.parameters import ControllerParameters
@@ -145,6 +147,38 @@ def test_a_trace_has_no_best_gain_and_says_why(agv_ncs: Callable[..., tuple[int,
     assert "trace" in found["best_kx_reason"]
     assert "closed form" in found["burst_max"]["mean_square_reason"]
     assert found["n_max"]["bursts"] == 14
+
+
+def test_a_trace_is_one_run_whatever_the_seed(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    trace, path = tmp_path / "lost.csv", tmp_path / "margins.json"
+    trace.write_text("lost\n1\n0\n1\n")
+    settings = ("error_detector.track=line", "plant.duration=20.0", f"relay.uplink.trace_file={trace}")
+    words = ["--set", "relay.uplink.model=trace", *(word for s in settings for word in ("--set", s))]
+    status, said = agv_ncs("stability", "config/paper.yaml", *words, "--json", path)
+    assert status == 0, said
+    assert "1 run, which contracts to" in " ".join(said.split())
+    assert json.loads(path.read_text())["empirical"]["different_runs"] == 1
+    status, said = agv_ncs("stability", "config/paper.yaml", *words, "--set", "plant.noise_xy=0.001", "--json", path)
+    assert status == 0, said
+    assert "20 of 20 runs contract" in " ".join(said.split())
+    assert json.loads(path.read_text())["empirical"]["different_runs"] == 20  # by their noise
+
+
+def test_twins_that_do_not_contract_are_a_disagreement() -> None:
+    """Only where the links as they are let E[e^2] die out; a tenth may fail."""
+    found = of("error_detector.track=line", "relay.uplink.model=bernoulli", "relay.uplink.p=0.5")
+    assert found.to_json()["uplink"]["mean_square_growth"] < 0.0
+
+    def said(*contraction: float, by: Margins = found, steps: int = 20_000) -> list[str]:
+        sentences = dataclasses.replace(by, twins=Twins(np.array(contraction), None, steps)).disagreements()
+        return [sentence for sentence in sentences if "twins" in sentence]
+
+    assert len(said(2.0)) == len(said(0.5, 0.5, 2.0, math.inf)) == 1
+    assert "2 of 4 contract" in said(0.5, 0.5, 2.0, math.inf)[0]
+    assert not said(*[0.5] * 9, 2.0)
+    assert not said(2.0, steps=100)  # E[e^2] has not died out after half a second
+    growing = of("error_detector.track=line", "relay.uplink.model=bernoulli", "relay.uplink.p=0.95")
+    assert not said(2.0, by=growing)
 
 
 def test_best_gains_are_those_of_a_held_pose(agv_ncs: Callable[..., tuple[int, str]]) -> None:
