@@ -22,14 +22,12 @@ loop Schenato et al., Foundations of control and estimation over lossy networks,
 
 from __future__ import annotations
 
-import itertools
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from agv_analysis.compiled import compiled
-from agv_analysis.link.markov_channel import Chain
+from agv_analysis.link.joint_chain import OUTCOMES, JointChain
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import settled_growth
@@ -40,74 +38,13 @@ POLICIES = ("hold", "zero")
 _LARGEST = 400
 """Size of the recursion's matrix up to which its eigenvalues are asked for instead of driving laps."""
 
-_OUTCOMES = ((True, True), (True, False), (False, True), (False, False))
-"""(is the pose delivered, is the command delivered)."""
-
-
-class JointChain(NamedTuple):
-    """Both links as one Markov chain with four outcomes a step; so links may fail together."""
-
-    transition: Floats
-    """T, probability of state t after state s, shape (s, s)."""
-    outcomes: Floats
-    """P(o | s): pose and command delivered, pose alone, command alone, neither; shape (s, 4)."""
-
-
-def independent(uplink: Chain, downlink: Chain) -> JointChain:
-    """Links that lose independently of each other."""
-    u, d = (grid.ravel() for grid in np.meshgrid(uplink.delivery, downlink.delivery, indexing="ij"))
-    outcomes = [(u if pose else 1.0 - u) * (d if command else 1.0 - d) for pose, command in _OUTCOMES]
-    return JointChain(np.asarray(np.kron(uplink.transition, downlink.transition)), np.stack(outcomes, axis=1))
-
-
-def correlated(uplink: Chain, downlink: Chain, share: float) -> JointChain:
-    """Links of which the downlink draws the uplink's random numbers in a `share` of the slots, as the relay's do.
-
-    A message is delivered if a number in [0, 1) is below g, and a channel leaves its state if another one is below the
-    probability of that. A state is one of both channels and whether their numbers are the same in this slot. For
-    channels of at most two states, and for those whose transitions are certain.
-    """
-    apart = independent(uplink, downlink)
-    if share == 0.0:
-        return apart
-    pairs = list(itertools.product(range(len(uplink.delivery)), range(len(downlink.delivery))))
-    outcomes = [_alike(_delivered_first(uplink, i), _delivered_first(downlink, j)).ravel() for i, j in pairs]
-    moves = []
-    for i, j in pairs:
-        to_up, to_down = _leaving_first(uplink, i), _leaving_first(downlink, j)
-        move = np.zeros((len(uplink.delivery), len(downlink.delivery)))
-        move[np.ix_(to_up, to_down)] = _alike(uplink.transition[i, to_up], downlink.transition[j, to_down])
-        moves.append(move.ravel())
-    moved = np.concatenate((apart.transition, np.array(moves)))
-    transition = np.hstack(((1.0 - share) * moved, share * moved))
-    return JointChain(transition, np.concatenate((apart.outcomes, outcomes)))
-
-
-def _delivered_first(chain: Chain, state: int) -> Floats:
-    return np.array([chain.delivery[state], 1.0 - chain.delivery[state]])
-
-
-def _leaving_first(chain: Chain, state: int) -> list[int]:
-    """The states after `state`, itself as the last."""
-    return [other for other in range(len(chain.delivery)) if other != state] + [state]
-
-
-def _alike(first: Floats, second: Floats) -> Floats:
-    """P(a, b) of two events decided by the same number in [0, 1): that falls into part a of one, part b of the other.
-
-    Lengths of the parts, shapes (m,) and (n,), in order; shape (m, n).
-    """
-    ends, others = np.cumsum(first), np.cumsum(second)
-    below = np.minimum(ends[:, None], others)  # P(part a or one before, part b or one before)
-    return np.asarray(np.diff(np.diff(below, axis=0, prepend=0.0), axis=1, prepend=0.0))
-
 
 def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> float:
     """Growth (logarithm) of the second moments over a lap. Where the loop changes by driving laps until it settles.
 
     `stops`: the plant stops where a command is lost, instead of holding the one before.
     """
-    maps = np.stack([step_maps(loop, *outcome, stops) for outcome in _OUTCOMES], axis=1)
+    maps = np.stack([step_maps(loop, *outcome, stops) for outcome in OUTCOMES], axis=1)
     states, size = len(links.transition), maps.shape[-1]
     if loop.is_constant and states * size**2 <= _LARGEST:
         return loop.steps * math.log(np.abs(np.linalg.eigvals(operator(maps[0], links))).max())

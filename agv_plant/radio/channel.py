@@ -34,14 +34,15 @@ def own_stream(parameters: ChannelParameters, stream: str) -> str:
 def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
     """Random numbers of a channel's slots first .. first + count - 1, uniform in [0, 1), shape (count, DRAWS).
 
-    In a share `correlation` of the slots they are those of the uplink. Of two equal channels without memory the losses
-    then have exactly this correlation coefficient.
+    In a share `correlation` of the slots they are those of the same vehicle's uplink. Of two equal channels without
+    memory the losses then have exactly this correlation coefficient.
     """
     own = uniforms(seed, own_stream(parameters, stream), first, count)
     if parameters.correlation == 0.0:
         return own
-    shared = uniforms(seed, f"{stream}/correlation", first, count)[:, :1] < parameters.correlation
-    return np.where(shared, uniforms(seed, UPLINK, first, count), own)
+    which = uniforms(seed, f"{own_stream(parameters, stream)}/correlation", first, count)[:, :1]
+    uplink = uniforms(seed, own_stream(parameters, UPLINK), first, count)
+    return np.where(which < parameters.correlation, uplink, own)
 
 
 def delay_draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from agv_analysis.link import joint_chain
 from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.stability import mean_square_two_links
 from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts, finite, growth_text
@@ -24,7 +25,7 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     if reason or uplink is None or downlink is None:
         yield Margin(name, label, None, reason=reason)
         return
-    links = mean_square_two_links.correlated(uplink, downlink, relay.downlink.correlation)
+    links = joint_chain.correlated(uplink, downlink, relay.downlink.correlation)
     growth = mean_square_two_links.lap_growth(facts.loop, links, policy == "zero") / facts.loop.steps
     yield Margin(name, label, finite(growth), growth_text(growth))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+from agv_analysis.link import joint_chain
 from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import mean_square, mean_square_two_links
@@ -26,11 +27,16 @@ NOT_MET = "not met: the error does not contract even without losses"
 
 
 def growth_on_both_links(facts: RunFacts) -> float | None:
-    """Growth of E[e^2] per step under both fitted channels; None if no command was lost, or for other policies."""
+    """Growth of E[e^2] per step under both fitted channels; None if no command was lost, or for other policies.
+
+    Where the recorded outcomes say that the links fail together, or by turns, they are one chain.
+    """
     run, policy = facts.run, facts.run.scenario.plant.downlink_policy
     if policy not in mean_square_two_links.POLICIES or not run.downlink_lost.any():
         return None
-    links = mean_square_two_links.independent(facts.fit.chain, facts.downlink_fit.chain)
+    links = joint_chain.fitted(run.lost, run.downlink_lost)
+    if links is None:
+        links = joint_chain.independent(facts.fit.chain, facts.downlink_fit.chain)
     return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from agv_analysis.link.joint_chain import independent
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.run import Floats
 from agv_analysis.stability import (
@@ -25,7 +26,6 @@ from agv_analysis.stability import (
 )
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
-from agv_analysis.stability.mean_square_two_links import independent
 from agv_cloud.parameters import ControllerParameters
 from test.agv_analysis.stability.general_loops import (
     KINDS,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agv_analysis.link.joint_chain import correlated, independent
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.run import Floats
 from agv_analysis.scenario import load_scenario
@@ -16,7 +17,6 @@ from agv_analysis.simulation import simulate_batch
 from agv_analysis.stability import mean_square, mean_square_two_links
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.margins import margins
-from agv_analysis.stability.mean_square_two_links import correlated, independent
 from agv_cloud.parameters import ControllerParameters
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import losses
