@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import numbers
-from agv_analysis.metrics.convergence import body_errors, wrapped
+from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.loop import (

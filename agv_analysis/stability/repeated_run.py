@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import numbers
-from agv_analysis.metrics.convergence import body_errors, wrapped
+from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links
