@@ -33,7 +33,7 @@ from agv_analysis.run import Floats
 from agv_analysis.stability.borders import last_stable
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radius
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
-from agv_analysis.stability.products import growths, multiply
+from agv_analysis.stability.products import assign, divide, growths, largest_entry, multiply
 from agv_analysis.stability.reception_maps import reception_maps
 
 _COLUMNS = 4
@@ -91,7 +91,9 @@ def _drive_held(F: Floats, G: Floats, steps: int, z: Floats, past: Floats) -> fl
     """As `_drive` says, of a loop whose pose is held; `past` has the errors h(k-n) .. h(k-1)."""
     (n, q, columns), m = past.shape, z.shape[0]
     ring, fresh = np.empty((n + 1, q, columns)), np.empty_like(z)
-    ring[:n], ring[n] = past, z[:q]
+    for i in range(n):
+        assign(past[i], ring[i])
+    assign(z, ring[n])
     log_scale, oldest = 0.0, 0
     for k in range(steps):
         row = k % F.shape[0]
@@ -105,14 +107,16 @@ def _drive_held(F: Floats, G: Floats, steps: int, z: Floats, past: Floats) -> fl
                     value += G[row, i, p] * ring[oldest, p, j]
                 fresh[i, j] = value
                 largest = max(largest, abs(value))
-        z[:], ring[oldest] = fresh, fresh[:q]
+        assign(fresh, z)
+        assign(fresh, ring[oldest])
         oldest = oldest + 1 if oldest < n else 0
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            z /= largest
-            ring /= largest
+            divide(z, largest)
+            for i in range(n + 1):
+                divide(ring[i], largest)
             log_scale += math.log(largest)
     for i in range(n):
-        past[i] = ring[(oldest + i) % (n + 1)]
+        assign(ring[(oldest + i) % (n + 1)], past[i])
     return log_scale
 
 
@@ -124,23 +128,32 @@ def _drive_predicted(
     With b the step at which the older part of the window ends: S(k) = P(k-1) .. P(b) older(k-n) + younger.
     """
     (n, q, columns), rows = past.shape, F.shape[0]
-    older, younger, S, h = np.zeros((n + 1, q, columns)), np.zeros((q, columns)), np.zeros((q, columns)), z[:q].copy()
+    older, younger, S, h = (
+        np.zeros((n + 1, q, columns)),
+        np.zeros((q, columns)),
+        np.zeros((q, columns)),
+        np.zeros((q, columns)),
+    )
+    identity, nothing = np.eye(q), np.zeros((q, columns))
     since, product, fresh = np.eye(q), np.eye(q), np.empty_like(z)
     log_scale, at = 0.0, n
     for k in range(steps):
         if n > 0:
             if at == n or k == 0:  # all that is in the window is in `past`, in order
                 at = 0
-                younger[:], since[:] = 0.0, np.eye(q)
+                assign(nothing, younger)
+                assign(identity, since)
                 for i in range(n - 1, -1, -1):
-                    older[i] = older[i + 1]
+                    assign(older[i + 1], older[i])
                     multiply(since, past[i], False, older[i], True)
                     multiply(since, P[(k - n + i) % rows], False, product, False)
-                    since[:] = product
-                since[:] = np.eye(q)
-            S[:] = younger
+                    assign(product, since)
+                assign(identity, since)
+            assign(younger, S)
             multiply(since, older[at], False, S, True)
-        h[:] = z[:q] - S
+        for i in range(q):
+            for j in range(columns):
+                h[i, j] = z[i, j] - S[i, j]
         row = k % rows
         multiply(F[row], z, False, fresh, False)
         multiply(G[row], h, False, fresh, True)
@@ -149,20 +162,27 @@ def _drive_predicted(
             multiply(E_z[row], z, False, nu, False)
             multiply(E_h[row], h, False, nu, True)
             multiply(P[row], younger, False, S, False)
-            younger[:] = S + nu
+            for i in range(q):
+                for j in range(columns):
+                    younger[i, j] = S[i, j] + nu[i, j]
             multiply(P[row], since, False, product, False)
-            since[:] = product
+            assign(product, since)
             at += 1
-        z[:] = fresh
-        largest = np.abs(fresh).max()
+        assign(fresh, z)
+        largest = largest_entry(fresh)
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            z /= largest
-            past /= largest
-            older /= largest
-            younger /= largest
+            divide(z, largest)
+            divide(younger, largest)
+            for i in range(n):
+                divide(past[i], largest)
+            for i in range(n + 1):
+                divide(older[i], largest)
             log_scale += math.log(largest)
     at %= max(1, n)
-    past[:] = np.concatenate((past[at:], past[:at]))
+    for i in range(n):
+        assign(past[(at + i) % n], older[i])
+    for i in range(n):
+        assign(older[i], past[i])
     return log_scale
 
 

@@ -28,7 +28,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_
 from agv_analysis.run import Floats
 from agv_analysis.stability.borders import borders
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
-from agv_analysis.stability.products import multiply
+from agv_analysis.stability.products import assign, divide, multiply
 
 _LAPS = 40
 
@@ -98,7 +98,12 @@ class Moments(NamedTuple):
     def unit(cls, loop: LinearLoop, states: int) -> Moments:
         """Moments for `lap_growth` to begin with."""
         m, q = loop.size, loop.outputs
-        return cls(*(np.array(np.broadcast_to(np.eye(*shape), (states, *shape))) for shape in ((m, m), (m, q), (q, q))))
+        return cls(
+            *(
+                np.array(np.broadcast_to(np.eye(*shape), (states, *shape)), order="C")
+                for shape in ((m, m), (m, q), (q, q))
+            )
+        )
 
     def size(self) -> float:
         """Sum of all mean squares."""
@@ -122,11 +127,8 @@ def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, s
 
 def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:
     """Sends the moments through so many steps, in place; they are to be multiplied by exp(what it returns)."""
-    q = loop.outputs
-    H = np.empty((0, q, q)) if loop.H is None else loop.H
-    K = np.empty((0, q, loop.size)) if loop.K is None else loop.K
     return lambda steps: float(
-        compiled(_drive_lap)(loop.F, loop.G, H, K, chain.transition, chain.delivery, steps, *moments)
+        compiled(_drive_lap)(loop.F, loop.G, loop.H, loop.K, chain.transition, chain.delivery, steps, *moments)
     )
 
 
@@ -156,11 +158,20 @@ def settled_growth(
 
 
 def _drive_lap(
-    F: Floats, G: Floats, H: Floats, K: Floats, T: Floats, g: Floats, steps: int, zz: Floats, zh: Floats, hh: Floats
+    F: Floats,
+    G: Floats,
+    H: Floats | None,
+    K: Floats | None,
+    T: Floats,
+    g: Floats,
+    steps: int,
+    zz: Floats,
+    zh: Floats,
+    hh: Floats,
 ) -> float:
     """Send `Moments` through so many steps; in place, to be multiplied by exp(return value).
 
-    H has no row where it is the identity, K none where it is zero.
+    H is None where it is the identity, K where it is zero: the branches that this leaves out are not compiled.
     """
     states, m, q = zh.shape
     log_scale = 0.0
@@ -174,41 +185,42 @@ def _drive_lap(
         for i in range(m):
             for j in range(m):
                 M[i, j] = F[row, i, j] + G[row, i, j] if j < q else F[row, i, j]
-        if len(H):
-            N[:, :q] = H[row]
-            if len(K):
-                N[:, q:] = 0.0
-                N += K[row]
+        if H is not None:
+            for i in range(q):
+                for j in range(m):
+                    N[i, j] = H[row, i, j] if j < q else 0.0
+                    if K is not None:
+                        N[i, j] += K[row, i, j]
         for i in range(states):
             multiply(M, zz[i], False, of_z, False)
             _symmetric_product(of_z, M, received_zz[i], False)
-            if len(H):
+            if H is not None:
                 multiply(of_z, N, True, received_zh[i], False)
                 multiply(N, zz[i], False, h_of_z, False)
                 _symmetric_product(h_of_z, N, received_hh[i], False)
             else:
-                _copy(of_z, received_zh[i])
-                _copy(zz[i], received_hh[i])
+                assign(of_z, received_zh[i])
+                assign(zz[i], received_hh[i])
             multiply(F[row], zh[i], False, of_h, False)
             multiply(G[row], hh[i], False, of_h, True)
             multiply(F[row], zz[i], False, of_z, False)
             multiply(G[row], zh[i], True, of_z, True)
             _symmetric_product(of_z, F[row], missed_zz[i], False)
             _symmetric_product(of_h, G[row], missed_zz[i], True)
-            if len(H):
+            if H is not None:
                 multiply(of_h, H[row], True, missed_zh[i], False)
                 multiply(H[row], hh[i], False, h_of_h, False)
-                if len(K):
+                if K is not None:
                     multiply(of_z, K[row], True, missed_zh[i], True)
                     multiply(K[row], zh[i], False, h_of_h, True)
                     multiply(K[row], zz[i], False, h_of_z, False)
                     multiply(H[row], zh[i], True, h_of_z, True)
                 _symmetric_product(h_of_h, H[row], missed_hh[i], False)
-                if len(K):
+                if K is not None:
                     _symmetric_product(h_of_z, K[row], missed_hh[i], True)
             else:
-                _copy(of_h, missed_zh[i])
-                _copy(hh[i], missed_hh[i])
+                assign(of_h, missed_zh[i])
+                assign(hh[i], missed_hh[i])
         largest = 0.0
         for j in range(states):
             _mix(T[:, j], g, received_zz, missed_zz, zz[j])
@@ -219,9 +231,10 @@ def _drive_lap(
             for p in range(q):
                 largest = max(largest, hh[j, p, p])
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            zz /= largest
-            zh /= largest
-            hh /= largest
+            for j in range(states):
+                divide(zz[j], largest)
+                divide(zh[j], largest)
+                divide(hh[j], largest)
             log_scale += math.log(largest)
     return log_scale
 
@@ -234,13 +247,6 @@ def _mix(weights: Floats, g: Floats, received: Floats, missed: Floats, mixed: Fl
             for i in range(len(g)):
                 value += weights[i] * (g[i] * received[i, p, r] + (1.0 - g[i]) * missed[i, p, r])
             mixed[p, r] = value
-
-
-def _copy(source: Floats, copy: Floats) -> None:
-    """`copy` = the first rows and columns of `source`."""
-    for i in range(copy.shape[0]):
-        for j in range(copy.shape[1]):
-            copy[i, j] = source[i, j]
 
 
 def _symmetric_product(A: Floats, B: Floats, product: Floats, add: bool) -> None:

@@ -31,6 +31,7 @@ from agv_analysis.link.joint_chain import OUTCOMES, JointChain
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import settled_growth
+from agv_analysis.stability.products import divide
 
 POLICIES = ("hold", "zero")
 """Downlink policies that are a Markov jump linear system of (z, h, u); others remember more."""
@@ -48,7 +49,7 @@ def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> floa
     states, size = len(links.transition), maps.shape[-1]
     if loop.is_constant and states * size**2 <= _LARGEST:
         return loop.steps * math.log(np.abs(np.linalg.eigvals(operator(maps[0], links))).max())
-    moments = np.array(np.broadcast_to(np.eye(size), (states, size, size)))
+    moments = np.array(np.broadcast_to(np.eye(size), (states, size, size)), order="C")
     return settled_growth(
         loop,
         (moments,),
@@ -89,7 +90,9 @@ def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: i
     for k in range(steps):
         row = k % maps.shape[0]
         for s in range(states):
-            after[s] = 0.0
+            for i in range(size):
+                for j in range(size):
+                    after[s, i, j] = 0.0
             for outcome in range(maps.shape[1]):
                 weight = probabilities[s, outcome]
                 if weight > 0.0:
@@ -97,14 +100,17 @@ def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: i
                     _add_symmetric(half, maps[row, outcome], weight, after[s])
         largest = 0.0
         for t in range(states):
-            moments[t] = 0.0
-            for s in range(states):
-                if transition[s, t] > 0.0:
-                    moments[t] += transition[s, t] * after[s]
+            for i in range(size):
+                for j in range(size):
+                    moments[t, i, j] = 0.0
+                    for s in range(states):
+                        if transition[s, t] > 0.0:
+                            moments[t, i, j] += transition[s, t] * after[s, i, j]
             for i in range(size):
                 largest = max(largest, moments[t, i, i])
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            moments /= largest
+            for t in range(states):
+                divide(moments[t], largest)
             log_scale += math.log(largest)
     return log_scale
 

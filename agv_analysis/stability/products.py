@@ -90,6 +90,34 @@ def _orthogonalised_pass(factors: Floats, basis: Floats, logs: Floats) -> None:
                 basis[i, j] = image[i, j] / length if length > 0.0 else 0.0
 
 
+def assign(source: Floats, target: Floats) -> None:
+    """`target` = `source`, shape (p, r); of a larger `source` its first rows and columns.
+
+    Written out, as what follows: numba takes seconds to compile `target[:] = source` or `matrix /= divisor`.
+    """
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
+
+
+def divide(matrix: Floats, divisor: float) -> None:
+    """`matrix` /= `divisor`, shape (p, r)."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] /= divisor
+
+
+def largest_entry(matrix: Floats) -> float:
+    """Largest modulus of the entries of a matrix, NaN if one is NaN."""
+    largest = 0.0
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            size = abs(matrix[i, j])
+            if size > largest or math.isnan(size):
+                largest = size
+    return largest
+
+
 def multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool) -> None:
     """`product` = A B, or A B' if `transposed`; added to what is there if `add`. Shapes (p, s), (s, r) and (p, r).
 

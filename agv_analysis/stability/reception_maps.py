@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.products import multiply
+from agv_analysis.stability.products import assign, multiply
 
 
 def burst_maps(loop: LinearLoop, longest: int, begins: NDArray[np.int64] | None = None) -> Iterator[Floats]:
@@ -56,41 +56,47 @@ def interval_maps(loop: LinearLoop, begins: NDArray[np.int64], lengths: NDArray[
     `lengths` in steps, >= 1, both of shape (n,); returns shape (n, m, m).
     """
     maps = np.empty((len(begins), loop.size, loop.size))
-    H = np.empty((0, loop.outputs, loop.outputs)) if loop.H is None else loop.H
-    K = np.empty((0, loop.outputs, loop.size)) if loop.K is None else loop.K
-    compiled(_fill_in_maps)(loop.F, loop.G, H, K, begins, lengths, maps)
+    compiled(_fill_in_maps)(loop.F, loop.G, loop.H, loop.K, begins, lengths, maps)
     return maps
 
 
 def _fill_in_maps(
-    F: Floats, G: Floats, H: Floats, K: Floats, received: NDArray[np.int64], lengths: NDArray[np.int64], maps: Floats
+    F: Floats,
+    G: Floats,
+    H: Floats | None,
+    K: Floats | None,
+    received: NDArray[np.int64],
+    lengths: NDArray[np.int64],
+    maps: Floats,
 ) -> None:
-    """`maps` of `reception_maps`; H has no row where it is the identity, K none where it is zero."""
+    """`maps` of `reception_maps`; H is None where it is the identity, K where it is zero."""
     size, outputs = G.shape[1], G.shape[2]
     M, M_next = np.empty((size, size)), np.empty((size, size))
     N, N_next = np.zeros((outputs, size)), np.empty((outputs, size))
     for r in range(len(received)):
         k = received[r] % len(F)
-        M[:] = F[k]  # the first step begins with z = I, h = C
+        assign(F[k], M)  # the first step begins with z = I, h = C
         for i in range(size):
             for j in range(outputs):
                 M[i, j] += G[k, i, j]
-        if len(H) != 0:
-            N[:, :outputs], N[:, outputs:] = H[k], 0.0
-            if len(K) != 0:
-                N += K[k]
+        if H is not None:
+            for i in range(outputs):
+                for j in range(size):
+                    N[i, j] = H[k, i, j] if j < outputs else 0.0
+                    if K is not None:
+                        N[i, j] += K[k, i, j]
         for _ in range(1, lengths[r]):
             k = k + 1 if k + 1 < len(F) else 0
             multiply(F[k], M, False, M_next, False)
-            if len(H) == 0:
+            if H is None:
                 for i in range(size):
                     for j in range(outputs):
                         M_next[i, j] += G[k, i, j]
             else:
                 multiply(G[k], N, False, M_next, True)
                 multiply(H[k], N, False, N_next, False)
-                if len(K) != 0:
+                if K is not None:
                     multiply(K[k], M, False, N_next, True)
-                N[:] = N_next
-            M[:] = M_next
-        maps[r] = M
+                assign(N_next, N)
+            assign(M_next, M)
+        assign(M, maps[r])

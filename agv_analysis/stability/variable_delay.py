@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.products import multiply
+from agv_analysis.stability.products import divide, largest_entry, multiply
 
 
 def age_sequence(loop: LinearLoop, n: NDArray[np.int64]) -> float:
@@ -46,8 +46,9 @@ def _follow(F: Floats, G: Floats, ages: NDArray[np.int64], states: Floats) -> fl
         row = k % F.shape[0]
         multiply(F[row], states[k], False, states[k + 1], False)
         multiply(G[row], states[k - ages[k], :outputs], False, states[k + 1], True)
-        largest = np.abs(states[k + 1]).max()
+        largest = largest_entry(states[k + 1])
         if largest > 1e100 or 0.0 < largest < 1e-100:
-            states[: k + 2] /= largest
+            for j in range(k + 2):
+                divide(states[j], largest)
             log_scale += math.log(largest)
     return log_scale
