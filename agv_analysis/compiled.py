@@ -58,23 +58,35 @@ def numbers(array: Any) -> Any:
     return array if HAS_NUMBA else array.tolist()
 
 
-def _compile(
-    function: Function, folder: Path | None, replacements: Replacements, inside: bool = False
-) -> Callable[..., Any]:
-    """`function` compiled, to be kept in `folder` if there is one, or to be put `inside` each of its callers."""
+def _compile(function: Function, folder: Path | None, replacements: Replacements) -> Callable[..., Any]:
+    """`function` compiled, to be kept in `folder` if there is one."""
     import numba
 
-    inner = {
-        name: _compile(called, None, replacements, inside=True) for name, called in calls_of(function, replacements)
-    }
-    copy = with_globals(function, inner)
+    copy = with_globals(function, _compiled_calls(function, replacements, {}))
     usual = numba.config.CACHE_DIR
     try:
         numba.config.CACHE_DIR = str(folder or "")  # looked at by the decorator, not later
-        dispatcher: Callable[..., Any] = numba.njit(nogil=True, cache=folder is not None, forceinline=inside)(copy)
+        dispatcher: Callable[..., Any] = numba.njit(nogil=True, cache=folder is not None)(copy)
     finally:
         numba.config.CACHE_DIR = usual
     return dispatcher
+
+
+def _compiled_calls(function: Function, replacements: Replacements, made: dict[Function, Any]) -> dict[str, Any]:
+    """What a function calls, by name, compiled to be put inside each of its callers; `made` is what already is.
+
+    Each is compiled once, however many call it, and without what Python would need to call it, which takes as long
+    as the function itself where arguments are nested tuples.
+    """
+    import numba
+
+    inside = numba.njit(nogil=True, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    found = {}
+    for name, called in calls_of(function, replacements):
+        if called not in made:
+            made[called] = inside(with_globals(called, _compiled_calls(called, replacements, made)))
+        found[name] = made[called]
+    return found
 
 
 def _cache_folder(function: Function, replacements: Replacements) -> Path | None:

@@ -114,6 +114,33 @@ def test_a_change_in_any_file_or_constant_is_seen_in_spite_of_the_cache(tmp_path
     assert in_another_process(CALL, cache, str(folder)) == "400.0\n"
 
 
+def shared(x: float) -> float:
+    return 2.0 * x
+
+
+def first(x: float) -> float:
+    return shared(x) + 1.0
+
+
+def second(x: float) -> float:
+    return shared(x) - first(x)
+
+
+def both(x: float) -> float:
+    return first(x) * second(x) + shared(x)
+
+
+def test_a_function_that_several_call_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    event = pytest.importorskip("numba.core.event")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # where nothing is kept yet
+    with event.install_recorder("numba:compile") as recorder:
+        assert compiled(both)(3.0) == both(3.0) == -1.0
+    names = [entry.data["dispatcher"].py_func.__name__ for _, entry in recorder.buffer if entry.is_start]
+    assert sorted(name for name in names if name in ("both", "first", "second", "shared")) == [
+        "both", "first", "second", "shared",
+    ]  # fmt: skip
+
+
 LOST = """
 import sys
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
