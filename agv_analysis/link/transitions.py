@@ -77,12 +77,13 @@ class Transitions:
         return np.clip(p, 1e-300, 1.0), np.clip(r, 1e-300, 1.0)
 
     def pessimistic_posterior(self, size: int = SAMPLES) -> tuple[Floats, Floats]:
-        """As `posterior`, as if half an outage more had begun and one less had ended, where any was seen.
+        """As `posterior`, as if half an outage more had begun and up to a whole one less had ended, where any was seen.
 
         For what is said of a link to be wrong no more often than it claims, which a posterior holds only on average.
         """
         rng = np.random.default_rng(_SEED)
-        begun, ended = self.to_lost + (0.5 if self.to_lost == 0 else 1.0), max(0.5, self.to_delivered - 0.5)
+        begun = self.to_lost + (0.5 if self.to_lost == 0 else 1.0)
+        ended = max(0.5, self.to_delivered - min(0.5, 0.25 * self.to_delivered))
         p = rng.beta(begun, self.delivered - self.to_lost + 0.5, size)
         r = rng.beta(ended, self.missed - self.to_delivered + 1.0, size)
         return np.clip(p, 1e-300, 1.0), np.clip(r, 1e-300, 1.0)

@@ -14,6 +14,7 @@ many, is sure.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -71,11 +72,16 @@ class GrowthPosterior:
 
     def times_longer(self) -> float | None:
         """How many times as long a recording like this one must be for a sure word; None: no length would do."""
-        for factor in np.geomspace(1.0, _LONGEST, 25):
-            stable = self._probability(self.transitions.times(float(factor)))
-            if not 1.0 - SURE < stable < SURE:
-                return float(factor)
-        return None
+        if not self._decided_by(_LONGEST):
+            return None
+        low, high = 1.0, _LONGEST
+        while high > 1.1 * low:
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if self._decided_by(middle) else (middle, high)
+        return high
+
+    def _decided_by(self, factor: float) -> bool:
+        return not 1.0 - SURE < self._probability(self.transitions.times(factor)) < SURE
 
     def _probability(self, transitions: Transitions) -> float:
         """That of the less sure of two posteriors, 1/2 if they do not agree."""

@@ -16,6 +16,7 @@ Linear Systems, 2005.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +44,10 @@ _WINDOW = 8
 
 _WINDOWS = 40
 
-_TILTS = 4
+_TILTS = 8
+
+_STEEPEST = 10.0
+"""Growth per step (logarithm) beyond which none is looked for."""
 
 Lengths = NDArray[np.int64]
 
@@ -151,18 +155,31 @@ def _growths(operators: Floats, shares: Floats, weights: Floats, spans: Floats, 
 
 
 def _tilted(flat: Floats, shares: Floats, spans: Floats) -> float:
-    """Growth g per step at one place: the spectral radius of E[exp(-g L) M_L (x) M_L] is 1; by secants from 0."""
-    size = int(np.sqrt(flat.shape[1]))
+    """Growth g per step at one place, where the spectral radius of E[exp(-g L) M_L (x) M_L] is 1.
+
+    It falls with g. False position (Illinois) from a first step away from 0 that is doubled until it is too long.
+    """
+    size = math.isqrt(flat.shape[1])
 
     def log_at(g: float) -> float:
         tilts = shares * np.exp(np.clip(-g * spans, -700.0, 700.0))
         return float(log_radius((tilts @ flat).reshape(size, size)))
 
-    before, value = 0.0, log_at(0.0)
-    g = value / float(shares @ spans)
+    g, value = 0.0, log_at(0.0)
+    if not np.isfinite(value) or value == 0.0:
+        return value
+    step = math.copysign(min(abs(value) / float(shares @ spans), 1.0 / float(spans.max())), value)
+    other = log_at(step)
+    while other * value > 0.0 and abs(step) < _STEEPEST:
+        g, value, step = step, other, 2.0 * step
+        other = log_at(step)
     for _ in range(_TILTS):
-        now = log_at(g)
-        if not np.isfinite(now) or now == value:
+        at = (g * other - step * value) / (other - value)
+        found = log_at(at)
+        if found * value > 0.0:
+            g, value, other = at, found, 0.5 * other
+        else:
+            step, other, value = at, found, 0.5 * value
+        if abs(step - g) <= 1e-6 * abs(at):
             break
-        before, g, value = g, g - now * (g - before) / (now - value), now
-    return g
+    return at
