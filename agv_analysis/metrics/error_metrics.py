@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled, numbers
 from agv_analysis.metrics.bands import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_analysis.run import Floats
 from agv_cloud.tracking_error import tracking_error
@@ -42,8 +44,18 @@ def body_errors(reference: Floats, pose: Floats) -> Floats:
 
     `reference` has shape (N, 3) or more columns, of which the first three count; `pose` has shape (N, 3).
     """
-    rows = zip(reference[:, :3].tolist(), pose.tolist(), strict=True)
-    return np.array([tracking_error(*x_r, *x_c) for x_r, x_c in rows], dtype=np.float64).reshape(-1, 3)
+    rows = np.empty((len(pose), 3))
+    if len(rows):  # copies, so that all arrays are of one kind and one compilation serves them
+        compiled(fill_errors)(numbers(np.array(reference[:, :3])), numbers(np.array(pose)), rows)
+    return rows
+
+
+def fill_errors(reference: Any, pose: Any, rows: Floats) -> None:
+    """Fill in the tracking error of each pose, shapes (N, 3)."""
+    for k in range(len(rows)):
+        x_r, y_r, theta_r = reference[k]
+        x_c, y_c, theta_c = pose[k]
+        rows[k, 0], rows[k, 1], rows[k, 2] = tracking_error(x_r, y_r, theta_r, x_c, y_c, theta_c)
 
 
 def wrapped(angle: Floats) -> Floats:

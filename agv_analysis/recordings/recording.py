@@ -28,8 +28,8 @@ from agv_analysis.recordings.node_parameters import EVENTS, Said, said_by_nodes
 from agv_analysis.recordings.slot_outcomes import slot_outcomes
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
+from agv_analysis.simulation.reference import reference_of
 from agv_cloud.parameters import PATH
-from agv_cloud.reference.reference import Reference
 from agv_ros.errors import UserError
 
 TOPICS = (
@@ -145,7 +145,7 @@ def _reference(topics: Mapping[str, OnSteps], k: Steps, scenario: Scenario, sour
     Where the edge did not answer, the recorded ones are interpolated. Raises UserError if there are none.
     """
     if scenario.error_detector.track != PATH:
-        return Reference(scenario.error_detector).first(int(k[-1]) + 1)[k]
+        return reference_of(scenario.error_detector, int(k[-1]) + 1)[k]
     poses, errors = topics.get("edge/reference_pose", NOTHING), topics["edge/error"]
     known = np.intersect1d(poses.k, errors.k, assume_unique=True)
     if not len(known):

@@ -180,8 +180,10 @@ def _why_not(run: Run, usable: NDArray[np.bool_]) -> str:
         return "the controller's gains are not known, so the commands cannot be held against them"
     if not usable.any():
         return "no step has both an error and a command, so the commands cannot be held against the control law"
-    if _known_until(run, usable) < len(run):
-        row, law = _known_until(run, usable), run.scenario.controller.law
+    row, law = _known_until(run, usable), run.scenario.controller.law
+    if row == 0:
+        return f"{law} remembers, and the recording begins at step {run.k[0]}: its commands cannot be checked"
+    if row < len(run):
         return f"{law} remembers, and steps are missing: its commands can only be checked before step {run.k[row]}"
     return ""
 

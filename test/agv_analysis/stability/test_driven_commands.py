@@ -9,7 +9,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -21,6 +21,9 @@ from agv_analysis.simulation import simulate
 from agv_analysis.stability.driven_commands import driven_commands, wrong_errors
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
+
+if TYPE_CHECKING:
+    from test.conftest import Code
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
 STEPS = 400
@@ -233,6 +236,40 @@ def test_json_has_no_infinity() -> None:
     json.dumps(plain, allow_nan=False)
     assert plain["differs"] is True
     assert json.loads(json.dumps(plain))["pieces"][0]["words"].startswith("no v_max")
+
+
+LAW_WITH_MEMORY = """
+import dataclasses, math, sys
+import numpy as np
+import agv_ncs
+from agv_analysis.stability.driven_commands import driven_commands
+
+def integral(x_e, y_e, theta_e, v_r, w_r, ts, memory=(0.0,), kp=2.0, ki=0.5):
+    s = memory[0] + ts * x_e
+    return v_r * math.cos(theta_e) + kp * x_e + ki * s, w_r + v_r * (y_e + 2.0 * math.sin(theta_e)), (s,)
+
+agv_ncs.register_control_law("integral", integral)
+settings = ["controller.law=integral", "plant.duration=2.0", "relay.uplink.model=bernoulli", "relay.uplink.p=0.3"]
+scenario = agv_ncs.load_scenario(sys.argv[0], settings)
+run = agv_ncs.simulate(scenario)
+print(driven_commands(run).sentence or "same")
+other = scenario.with_settings(["controller.integral.ki=0.7"])
+print(driven_commands(dataclasses.replace(run, scenario=other)).sentence)
+error = run.error.copy()
+error[300] = np.nan
+gap = driven_commands(dataclasses.replace(run, error=error))
+print(gap.compared, gap.sentence or "same", gap.cannot_say, sep="|")
+print(driven_commands(dataclasses.replace(run, k=run.k + 10)).cannot_say)
+"""
+
+
+def test_a_law_that_remembers_is_checked_up_to_the_first_gap(without_ros: Code) -> None:
+    assert without_ros(LAW_WITH_MEMORY, PAPER).splitlines() == [
+        "same",
+        "400 of 400 commands are not those of integral with these parameters, the first at step 0 (0 s)",
+        "300|same|integral remembers, and steps are missing: its commands can only be checked before step 300",
+        "integral remembers, and the recording begins at step 10: its commands cannot be checked",
+    ]
 
 
 # -- no false alarms ---------------------------------------------------------------------------------------------------
