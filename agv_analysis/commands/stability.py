@@ -62,8 +62,10 @@ def command(
 
     from agv_analysis.report.table import colour_of
     from agv_analysis.scenario import load_scenario
+    from agv_analysis.stability.empirical import simulated_twins, with_an_end
     from agv_analysis.stability.evidence import evidence_of_scenario
     from agv_analysis.stability.margins import margins
+    from agv_analysis.stability.twins_border import twins_border
     from agv_analysis.stability.verdict import decide
 
     scenario = load_scenario(params, settings)
@@ -71,11 +73,14 @@ def command(
         _map(scenario, axes, points, csv_file or Path("map.csv"), picture or Path("map.png"))
         return
     console = Console(highlight=False)
-    with Console(stderr=True).status("computing the margins ..."):
-        found = margins(scenario)
-        twins, seeds = _twins(scenario)
+    seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
+    with Console(stderr=True).status("computing the margins ...") as status:
+        found, run = margins(scenario), with_an_end(scenario)
+        twins = simulated_twins(run, seeds)
+        status.update("simulating twins under more and more losses ...")
+        border = twins_border(run, progress=lambda done: status.update(f"simulating twins: {done} loss probabilities"))
+        found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
         verdict = decide(evidence_of_scenario(scenario, twins))
-        found = dataclasses.replace(found, twins=twins)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
@@ -91,6 +96,8 @@ def command(
         console.print(f"Best K_x, {objective.replace('_', ' ')}: {escape(choice.words)}")
     if not best:
         console.print(f"Best K_x: {why_no_gain}")
+    if found.recommendation:
+        console.print(f"[bold]Design with[/] {escape(found.recommendation)}.")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     if found.infeasible:
@@ -102,15 +109,6 @@ def command(
     if json_file is not None:
         said = {"verdict": verdict.word, "verdict_criterion": verdict.criterion, "verdict_reason": verdict.reason}
         write_json(json_file, {**said, **found.to_json(), **_gains_to_json(best, why_no_gain)})
-
-
-def _twins(scenario: Scenario) -> tuple[Twins, range]:
-    """Twins of one lap of the scenario, or of all of it where it has an end, under several seeds."""
-    from agv_analysis.stability.empirical import simulated_twins, with_an_end
-
-    scenario = with_an_end(scenario)
-    seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
-    return simulated_twins(scenario, seeds), seeds
 
 
 def _told(twins: Twins, seeds: range) -> str:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli
 from agv_analysis.run import Floats
-from agv_analysis.stability.borders import crossing
+from agv_analysis.stability.borders import borders, crossing
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.products import orthogonalised_pass
 from agv_analysis.stability.reception_maps import reception_maps
@@ -29,6 +29,9 @@ from agv_plant.random_stream import uniforms
 
 STEPS = 400_000
 """Length of the random sequence: its exponents are good to about 1 %."""
+
+TOLERANCE = 0.01
+"""Relative tolerance of the gain over which the exponent along a straight track is averaged."""
 
 _BATCHES = 20
 
@@ -118,33 +121,68 @@ def critical_loss_along(a: float) -> float | None:
     return None
 
 
+def mean_log(a: float, lengths: NDArray[np.int64], tolerance: float) -> Floats:
+    """Mean of log|1 - x L| over x within a relative tolerance of a, by the antiderivative u log|u| - u of log|u|."""
+    low = np.asarray(1.0 - a * (1.0 + tolerance) * lengths)
+    high = np.asarray(1.0 - a * (1.0 - tolerance) * lengths)
+    return np.asarray((_antiderivative(high) - _antiderivative(low)) / (high - low))
+
+
+def _antiderivative(u: Floats) -> Floats:
+    return np.asarray(u * np.log(np.abs(u), where=u != 0.0, out=np.zeros_like(u)) - u)
+
+
+def averaged_exponent_along(a: float, chain: Chain, tolerance: float = TOLERANCE) -> float:
+    """As `exponent_along`, averaged over gains within a relative tolerance; finite, 1/a integer or not."""
+    probabilities = chain.burst_lengths()
+    lengths = np.arange(1, len(probabilities) + 1)
+    return float(probabilities @ mean_log(a, lengths, tolerance) / (probabilities @ lengths))
+
+
+def averaged_critical_loss_along(a: float, tolerance: float = TOLERANCE) -> float | None:
+    """As `critical_loss_along` by the averaged exponent; None if that stays negative up to 0.999."""
+    if not 0.0 < a < 2.0:
+        return -1.0
+
+    def exponent(p: float) -> float:
+        return averaged_exponent_along(a, bernoulli(p), tolerance)
+
+    found = borders(exponent, (1.0 - np.logspace(0.0, -3.0, 31)).tolist())
+    if not found:
+        return None
+    return float(found[0]) or -1.0
+
+
 def critical_loss(loop: LinearLoop, seed: int = 1) -> float | None:
     """Smallest loss probability at which the top exponent of a lap reaches 0, independent losses.
 
     -1 if it is not negative even without losses, None if it stays negative up to 0.999. Where the closed form holds,
-    along and across a straight track are two loops and the former is exact; others are simulated, good to about 0.002.
+    along and across a straight track are two loops; the former is averaged over gains within TOLERANCE, since the
+    exponent of one gain alone may be -inf, and exact. Others are simulated, good to about 0.002.
     There the little that a curve turns of one error into the other matters: near the border the error along the track
     makes such excursions that the loop diverges before the exponent along alone reaches 0.
     """
     if loop.closed_form is None or loop.predicts or np.any(loop.w_r != 0.0):
         return _simulated_critical_loss(loop, seed)
-    found = [critical_loss_along(loop.ts * loop.closed_form.kx)]
+    found = [averaged_critical_loss_along(loop.ts * loop.closed_form.kx)]
     if loop.size > 1:
         found.append(_simulated_critical_loss(loop.without_along(), seed))
     return min((p for p in found if p is not None), default=None)
 
 
 def _simulated_critical_loss(loop: LinearLoop, seed: int) -> float | None:
-    """By bisection of the logarithm of the delivery rate; the same random numbers serve every probability."""
+    """The first on a grid, then by bisection of the logarithm of the delivery rate; with the same random numbers."""
 
     def is_stable(delivery: float) -> bool:
         return bool(exponents(loop, bernoulli(1.0 - delivery), STEPS, seed).values[0] < 0.0)
 
-    high, low = 1.0, 1e-3
-    if not is_stable(high):
-        return -1.0
-    if is_stable(low):
+    tried = np.logspace(0.0, -3.0, 13).tolist()
+    first = next((i for i, delivery in enumerate(tried) if not is_stable(delivery)), None)
+    if first is None:
         return None
+    if first == 0:
+        return -1.0
+    high, low = tried[first - 1], tried[first]
     while high - low > 1e-3 * min(high, 1.0 - low + 1e-3):
         middle = math.sqrt(low * high)
         low, high = (low, middle) if is_stable(middle) else (middle, high)

@@ -20,10 +20,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain
-from agv_analysis.run import Floats
+from agv_analysis.stability.almost_sure import mean_log
 from agv_analysis.stability.joint_spectral_radius import largest_n_along
 from agv_analysis.stability.mean_square import along_spectral_radius
 
@@ -63,24 +62,13 @@ def best_almost_surely(chain: Chain, tolerance: float = TOLERANCE) -> tuple[floa
     weighted = float(probabilities @ lengths**2) / mean  # mean length of the burst that a step falls into
 
     def rate(log_a: float) -> float:
-        return float(probabilities @ _mean_log(math.exp(log_a), lengths, tolerance)) / mean
+        return float(probabilities @ mean_log(math.exp(log_a), lengths, tolerance)) / mean
 
     # Each burst length has a dip of its own, as wide as the tolerance: the grid is finer than that.
     grid = np.arange(math.log(0.1 / weighted), math.log(2.0) + tolerance, tolerance / 4.0)
     nearest = float(grid[np.argmin([rate(x) for x in grid])])
     best, found = minimum(rate, nearest - tolerance / 2.0, nearest + tolerance / 2.0)
     return math.exp(best), found
-
-
-def _mean_log(a: float, lengths: NDArray[np.int64], tolerance: float) -> Floats:
-    """Mean of log|1 - x L| over x within `tolerance` of a, by the antiderivative u log|u| - u of log|u|."""
-    low = np.asarray(1.0 - a * (1.0 + tolerance) * lengths)
-    high = np.asarray(1.0 - a * (1.0 - tolerance) * lengths)
-    return np.asarray((_antiderivative(high) - _antiderivative(low)) / (high - low))
-
-
-def _antiderivative(u: Floats) -> Floats:
-    return np.asarray(u * np.log(np.abs(u), where=u != 0.0, out=np.zeros_like(u)) - u)
 
 
 @dataclass(frozen=True)

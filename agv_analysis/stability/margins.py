@@ -117,6 +117,31 @@ class Margins:
     def _extra(self, name: str) -> Any:
         return next((margin.extra[name] for margin in self.found.values() if name in margin.extra), None)
 
+    @property
+    def recommendation(self) -> str:
+        """Which loss rate to design with, and why; empty where there is none to choose from."""
+        square, sure, twins = self.p_mean_square, self.p_almost_sure, self._value("p_max.twins")
+        if square is None:
+            return ""
+        if twins is not None and twins < square:
+            return (
+                f"a loss rate below {twins:.3g}, up to which most simulated twins contract: the mean square of small "
+                f"errors dies out up to {square:.4g}, but the loop's errors do not stay small"
+            )
+        borders = [
+            f"almost every run up to {sure:.4g} (small errors only)" if sure is not None and sure > square else ""
+        ]
+        borders += [f"most simulated twins up to {twins:.3g}" if twins is not None else ""]
+        others = " and ".join(border for border in borders if border)
+        proved = "" if self.n_bursts is None or self.n_bursts < 0 else (
+            f"; with outages of at most {self.n_bursts} slots, if the link guarantees that, whatever the rate"
+        )  # fmt: skip
+        why = f", though {others} converge{'s' if others.startswith('almost') else ''}" if others else ""
+        return (
+            f"the mean square, independent losses below {square:.4g}{why}: only below it does the mean of the squared "
+            f"error die out, and rare long outages do not decide how far the AGV goes{proved}"
+        )
+
     def disagreements(self) -> list[str]:
         """A sentence for each pair of criteria that say different things."""
         found = []
@@ -190,6 +215,7 @@ class Margins:
             "infeasible_reason": self.infeasible or None,
             "notes": list(self.notes),
             "left_out": list(self.left_out),
+            "recommendation": self.recommendation or None,
             "disagreements": self.disagreements(),
             **self._twins_to_json(),
         }

@@ -12,19 +12,17 @@ from agv_analysis.stability.criteria.criterion import Border, Criterion, Margin,
 from agv_analysis.stability.criteria.in_mean_square import NOT_MET
 from agv_analysis.stability.scenario_loop import straight_loop_of
 
+_NAME, _LABEL = "p_max.almost_sure", "Independent losses, almost surely, linear"
+
 
 def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
-    name, label, loop = "p_max.almost_sure", "Independent losses, almost surely", facts.loop
-    p, gains, reason = almost_sure.critical_loss(loop), loop.closed_form, ""
+    loop, reason = facts.loop, ""
+    p = almost_sure.critical_loss(loop)
     if p is None:
         reason = "no bound: almost every run converges at every loss probability up to 0.999"
     elif p < 0.0:
         p, reason = None, NOT_MET
-    elif gains and not loop.predicts and not loop.w_r.any() and almost_sure.is_degenerate(loop.ts * gains.kx):
-        reason = (
-            "1 / (T_s K_x) is an integer: on a straight track some burst brings the error along it to 0 at one stroke"
-        )
-    yield Margin(name, label, p, "" if p is None else f"below {p:.5g}", reason)
+    yield Margin(_NAME, _LABEL, p, "" if p is None else f"below {p:.5g}", reason)
 
 
 def _border(scenario: Scenario) -> float:
@@ -38,10 +36,10 @@ def _border(scenario: Scenario) -> float:
 CRITERION = Criterion(
     key="almost_sure",
     order=50,
-    title="Almost surely",
+    title="Almost surely, linear",
     asks="Does a small error die out in every run but a set of probability 0?",
     assumes="The linear loop; far from the reference `hold` leaves its range long before.",
     margins=_margins,
-    margin_names=(("p_max.almost_sure", "Independent losses, almost surely"),),
+    margin_names=((_NAME, _LABEL),),
     border=Border("almost surely", _border),
 )

@@ -1,0 +1,86 @@
+"""Mean square where poses are late as well as lost: the age of the pose as a Markov chain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from agv_analysis.link.age_chain import AgeChain, age_chain_of, fitted_ages
+from agv_analysis.stability import delayed_mean_square
+from agv_analysis.stability.criteria.criterion import (
+    Criterion,
+    Judgement,
+    Margin,
+    RunFacts,
+    ScenarioFacts,
+    finite,
+    growth_text,
+    has_late,
+)
+from agv_analysis.stability.linear_loop import LinearLoop
+
+_NAME, _LABEL = "late_poses.mean_square_growth", "Late and lost poses as they are, mean square"
+
+
+def growth_of_late_poses(facts: RunFacts) -> float | None:
+    """Growth of E[e^2] per step under the chain of ages fitted to a run; None where it does not apply.
+
+    It does where poses came late, by whatever delays, and commands came at once.
+    """
+    run = facts.run
+    if not (facts.is_feasible and has_late(run.uplink)) or has_late(run.downlink) or run.downlink_lost.any():
+        return None
+    if len(run) < 2 or int(run.k[-1] - run.k[0]) + 1 != len(run):
+        return None
+    ages = fitted_ages(run.n_ul)
+    return None if _why_not(facts.loop, ages) else delayed_mean_square.lap_growth(facts.loop, ages) / len(run)
+
+
+def _why_not(loop: LinearLoop, ages: AgeChain) -> str:
+    """Why there is no answer for a loop and its chain of ages; empty if there is one."""
+    if loop.predicts and not loop.is_exact:
+        return "computed for a pose that is held, not for one that is predicted by a wrong model"
+    if delayed_mean_square.work(loop, ages) > delayed_mean_square.MOST_WORK:
+        return f"poses may be {ages.oldest} slots late, which would take minutes to compute"
+    return ""
+
+
+def _judge(facts: RunFacts) -> Judgement | None:
+    growth = growth_of_late_poses(facts)
+    if growth is None:
+        return None
+    return Judgement(
+        "Late and lost poses, mean square", growth < 0.0, f"{growth_text(growth)} under the chain of ages that fits",
+        {"late_mean_square_stable": growth < 0.0, "late_mean_square_growth": finite(growth)}, growth,
+    )  # fmt: skip
+
+
+def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
+    relay, ts = facts.scenario.relay, facts.scenario.plant.ts
+    if not relay.uplink.delays:
+        yield Margin(_NAME, _LABEL, None, reason="the uplink delays nothing", shown=False)
+        return
+    ages, reason = age_chain_of(relay.uplink, ts), ""
+    if relay.downlink.delays or relay.downlink.model != "perfect":
+        reason = "no answer: commands are late or lost as well"
+    elif ages is None:
+        reason = "no answer: losses with a memory and random delays, or a channel that is no finite Markov chain"
+    elif why := _why_not(facts.loop, ages):
+        reason = f"no answer: {why}"
+    if reason or ages is None:
+        yield Margin(_NAME, _LABEL, None, reason=reason)
+        return
+    growth = delayed_mean_square.lap_growth(facts.loop, ages) / facts.loop.steps
+    yield Margin(_NAME, _LABEL, finite(growth), growth_text(growth))
+
+
+CRITERION = Criterion(
+    key="late_and_lost",
+    order=65,
+    title="Late and lost poses, mean square",
+    asks="Does E[|e|^2] die out if poses are late as well as lost?",
+    assumes="That the age of the pose is a Markov chain: any losses behind a constant delay, or independent losses and "
+    "delays; of a run the ages that it shows. Commands arrive at once.",
+    judge=_judge,
+    margins=_margins,
+    margin_names=((_NAME, _LABEL),),
+)

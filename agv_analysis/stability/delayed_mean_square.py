@@ -1,0 +1,105 @@
+"""Mean square where poses are late as well as lost: z(k+1) = F z(k) + G y(k), y(k) = C z(k - n(k)), n a Markov chain.
+
+What arrives at a step is the error of i steps ago, C z(k-i), or nothing, and then y stays. So xi = (z(k), C z(k-1) ..
+C z(k-D), y(k-1)) is a Markov jump linear system; its modes are those of `agv_analysis.link.age_chain`, and with
+X_s = E[xi xi'; mode s]
+
+    X_t(k+1) = sum_s sum_i W_sit A_i(k) X_s(k) A_i(k)'
+
+dies out if and only if E[|z|^2] does. A_i moves the window on, of which most rows are copies: it is never formed.
+Source: Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005, theorem 3.9; for delays Xiao,
+Hassibi and How, Control with random communication delays via a discrete-time jump system approach, ACC 2000.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.compiled import compiled
+from agv_analysis.link.age_chain import AgeChain
+from agv_analysis.run import Floats
+from agv_analysis.stability import floquet
+from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.mean_square import settled_growth
+
+MOST_WORK = 2e9
+"""Numbers to be moved over a lap beyond which there is no answer: about a minute."""
+
+
+def work(loop: LinearLoop, ages: AgeChain) -> float:
+    """Numbers that are moved over a lap, or over the steps that stand for one where the loop is constant."""
+    size = loop.size + loop.outputs * (ages.oldest + 1)
+    return float(np.count_nonzero(ages.moves)) * size**2 * (2000 if loop.is_constant else loop.steps)
+
+
+def lap_growth(loop: LinearLoop, ages: AgeChain) -> float:
+    """Growth (logarithm) of the second moments over a lap, by driving laps until it settles.
+
+    Raises ValueError for a loop that predicts unless its model is exact: there a late pose is as good as a fresh one.
+    """
+    if loop.predicts and not loop.is_exact:
+        raise ValueError("late and lost poses are judged where they are held, not where they are predicted")
+    if loop.is_exact or ages.is_constant:
+        return 2.0 * floquet.constant_delay(loop, ages.oldest)
+    q, size = loop.outputs, loop.size + loop.outputs * (ages.oldest + 1)
+    moments = np.array(np.broadcast_to(np.eye(size), (len(ages.moves), size, size)))
+    return settled_growth(
+        loop, (moments,), lambda: float(np.trace(moments, axis1=1, axis2=2).sum()),
+        lambda steps: float(compiled(_drive_lap)(loop.F, loop.G, ages.moves, steps, q, moments)),
+    )  # fmt: skip
+
+
+def _drive_lap(F: Floats, G: Floats, moves: Floats, steps: int, q: int, moments: Floats) -> float:
+    """Send the moments, shape (s, n, n), through so many steps; in place, to be multiplied by exp(return value)."""
+    modes, size, m = moments.shape[0], moments.shape[1], F.shape[1]
+    after, half, moved = np.zeros_like(moments), np.zeros((size, size)), np.zeros((size, size))
+    source, log_scale = np.zeros(size, dtype=np.int64), 0.0
+    for i in range(size):  # of the window: each error becomes one step older
+        source[i] = i - m if i < m + q else i - q
+    for k in range(steps):
+        row = k % F.shape[0]
+        after[:] = 0.0
+        for s in range(modes):
+            for arrival in range(moves.shape[1]):
+                if moves[s, arrival].sum() == 0.0:
+                    continue
+                answered = size - q if arrival == moves.shape[1] - 1 else 0 if arrival == 0 else m + (arrival - 1) * q
+                for i in range(q):
+                    source[size - q + i] = answered + i
+                _move_rows(F[row], G[row], answered, source, moments[s], half)
+                _move_rows(F[row], G[row], answered, source, half.T, moved)
+                for t in range(modes):
+                    weight = moves[s, arrival, t]
+                    if weight > 0.0:
+                        after[t] += weight * moved
+        largest = 0.0
+        for t in range(modes):
+            for i in range(size):
+                for j in range(i + 1):  # rounding must not make a skew part
+                    mean = 0.5 * (after[t, i, j] + after[t, j, i])
+                    moments[t, i, j] = mean
+                    moments[t, j, i] = mean
+                largest = max(largest, moments[t, i, i])
+        if largest > 1e100 or 0.0 < largest < 1e-100:
+            moments /= largest
+            log_scale += math.log(largest)
+    return log_scale
+
+
+def _move_rows(F: Floats, G: Floats, answered: int, source: NDArray[np.int64], X: Floats, moved: Floats) -> None:
+    """`moved` = A X for one arrival: the errors at `answered` are acted on, the rows of the window are copies."""
+    m, q = G.shape
+    for i in range(m):
+        for j in range(X.shape[1]):
+            value = 0.0
+            for p in range(m):
+                value += F[i, p] * X[p, j]
+            for p in range(q):
+                value += G[i, p] * X[answered + p, j]
+            moved[i, j] = value
+    for i in range(m, X.shape[0]):
+        for j in range(X.shape[1]):
+            moved[i, j] = X[source[i], j]
