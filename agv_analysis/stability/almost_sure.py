@@ -176,7 +176,7 @@ def _simulated_critical_loss(loop: LinearLoop, seed: int) -> float | None:
     def is_stable(delivery: float) -> bool:
         return bool(exponents(loop, bernoulli(1.0 - delivery), STEPS, seed).values[0] < 0.0)
 
-    tried = np.logspace(0.0, -3.0, 13).tolist()
+    tried: list[float] = np.logspace(0.0, -3.0, 13).tolist()
     first = next((i for i, delivery in enumerate(tried) if not is_stable(delivery)), None)
     if first is None:
         return None

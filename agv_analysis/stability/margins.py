@@ -128,19 +128,15 @@ class Margins:
                 f"a loss rate below {twins:.3g}, up to which most simulated twins contract: the mean square of small "
                 f"errors dies out up to {square:.4g}, but the loop's errors do not stay small"
             )
-        borders = [
-            f"almost every run up to {sure:.4g} (small errors only)" if sure is not None and sure > square else ""
-        ]
-        borders += [f"most simulated twins up to {twins:.3g}" if twins is not None else ""]
-        others = " and ".join(border for border in borders if border)
-        proved = "" if self.n_bursts is None or self.n_bursts < 0 else (
-            f"; with outages of at most {self.n_bursts} slots, if the link guarantees that, whatever the rate"
-        )  # fmt: skip
-        why = f", though {others} converge{'s' if others.startswith('almost') else ''}" if others else ""
-        return (
-            f"the mean square, independent losses below {square:.4g}{why}: only below it does the mean of the squared "
-            f"error die out, and rare long outages do not decide how far the AGV goes{proved}"
+        others = [f"almost every run converges up to {sure:.4g} to first order"] if sure and sure > square else []
+        others += [] if twins is None else [f"most simulated twins contract up to {twins:.3g}"]
+        beyond = f"; {', '.join(others)}, but there rare long outages decide how far the AGV goes" if others else ""
+        guaranteed = (
+            ""
+            if self.n_bursts is None or self.n_bursts < 1
+            else f"; if the link guarantees outages of at most {self.n_bursts} slots, the loss rate does not matter"
         )
+        return f"the mean square, independent losses below {square:.4g}{beyond}{guaranteed}"
 
     def disagreements(self) -> list[str]:
         """A sentence for each pair of criteria that say different things."""

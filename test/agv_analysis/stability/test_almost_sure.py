@@ -15,6 +15,8 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_e
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.almost_sure import (
+    averaged_critical_loss_along,
+    averaged_exponent_along,
     critical_loss,
     critical_loss_along,
     exponent_along,
@@ -99,6 +101,23 @@ def test_gains_that_do_not_contract_even_without_losses() -> None:
     assert (critical_loss_along(0.0), critical_loss_along(2.0), critical_loss_along(2.5)) == (-1.0, -1.0, -1.0)
     assert critical_loss(constant(1.0, 0.0, ControllerParameters(kx=401.0))) == -1.0
     assert critical_loss(constant(1.0, 0.0, ControllerParameters(kx=0.0))) == -1.0
+
+
+@pytest.mark.parametrize("a", [1.0, 0.125, 0.13])
+def test_the_average_over_gains_by_many_gains(a: float) -> None:
+    """Gains within 1 %, by their exponents term by term; at a = 1/8 no neighbour is as stable as that gain alone."""
+    gains = a * (0.99 + 0.02 * (np.arange(400) + 0.5) / 400)
+    for p in (0.5, 0.9):
+        truth = float(np.mean([sum_along(float(x), p) for x in gains]))
+        assert averaged_exponent_along(a, bernoulli(p)) == pytest.approx(truth, abs=4e-3 * (1.0 - p))
+
+
+def test_a_gain_whose_inverse_is_an_integer_is_like_its_neighbours() -> None:
+    """K_x = 25 on a line, 1/a = 8: 0.995 across the track was all that was left; along it neighbours say 0.955."""
+    found = [critical_loss(constant(1.0, 0.0, ControllerParameters(kx=kx))) for kx in (24.5, 25.0, 25.5)]
+    assert found == pytest.approx([0.955] * 3, abs=0.004)
+    assert averaged_critical_loss_along(0.125) == pytest.approx(found[1], abs=1e-6)
+    assert [averaged_critical_loss_along(a) for a in (0.0, 2.0)] == [-1.0, -1.0]
 
 
 # -- all three errors ------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import pytest
 
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.criteria.any_outages import binding
+from agv_analysis.stability.criteria.criterion import Margin
 from agv_analysis.stability.empirical import Twins
 from agv_analysis.stability.linear_loop import kanayama_loop
 from agv_analysis.stability.margins import Margins, margins
@@ -162,6 +163,23 @@ def test_a_trace_is_one_run_whatever_the_seed(agv_ncs: Callable[..., tuple[int, 
     assert status == 0, said
     assert "20 of 20 runs contract" in " ".join(said.split())
     assert json.loads(path.read_text())["empirical"]["different_runs"] == 20  # by their noise
+
+
+def test_which_loss_rate_to_design_with() -> None:
+    """The mean square's, unless twins contract only up to less."""
+    found = of("error_detector.track=line")
+    said = found.recommendation
+    assert said.startswith("the mean square, independent losses below 0.8824")
+    assert "14 slots" in said
+    assert found.to_json()["recommendation"] == said
+
+    def with_twins(p: float) -> str:
+        border = Margin("p_max.twins", "twins", p)
+        return dataclasses.replace(found, found={**found.found, "p_max.twins": border}).recommendation
+
+    assert "most simulated twins contract up to 0.93" in with_twins(0.93)
+    assert with_twins(0.7).startswith("a loss rate below 0.7, up to which most simulated twins contract")
+    assert of("error_detector.track=line", "controller.kx=401.0").recommendation == ""
 
 
 def test_twins_that_do_not_contract_are_a_disagreement() -> None:
