@@ -14,9 +14,9 @@ from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Run
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts
 from agv_analysis.stability.criteria.paper_test import PaperTest
-from agv_analysis.stability.evidence import evidence_of_run, judgements_of
+from agv_analysis.stability.evidence import evidence_of_run, judgements_of, verdict_of_run
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
-from agv_analysis.stability.verdict import Evidence, Verdict, decide
+from agv_analysis.stability.verdict import Evidence, Verdict
 from agv_ros.errors import UserError
 
 GAINS_UNKNOWN = "the controller's gains are not known: name its params file with --config"
@@ -216,7 +216,7 @@ def analyse(run: Run) -> Analysis:
         convergence=convergence(run),
         fit=facts.fit,
         judgements=judgements,
-        verdict=decide(evidence),
+        verdict=verdict_of_run(facts, evidence),
         evidence=evidence,
         infeasible=facts.infeasible,
         nominal_notes=(*facts.loop.active_limits, *facts.loop.not_differentiable) if facts.is_feasible else (),

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
+from agv_analysis.link import joint_chain
 from agv_analysis.link.channel_fit import ChannelFit
-from agv_analysis.link.markov_channel import chain_of
+from agv_analysis.link.markov_channel import Chain, chain_of, gilbert_elliott
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability import joint_spectral_radius, mean_square
+from agv_analysis.stability import joint_spectral_radius, mean_square, mean_square_two_links
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import longest_for
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
+from agv_analysis.stability.driven_commands import driven_commands, scenarios_of
 from agv_analysis.stability.empirical import Twins, with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.repeated_run import RepeatedRun, repeated_run
-from agv_analysis.stability.verdict import Evidence
+from agv_analysis.stability.verdict import Evidence, Verdict, decide, weakest
 
 _TIMES_AS_FAR = 2.0
 """A recorded deviation may be this many times the simulated one, for what the model of the plant does not know."""
@@ -38,8 +41,27 @@ def judgements_of(facts: RunFacts) -> dict[str, Judgement]:
     return {key: found for key, found in judged.items() if found is not None}
 
 
+def verdict_of_run(facts: RunFacts, evidence: Evidence) -> Verdict:
+    """The word on a run. Where parameters were changed while it went on, the worst of its parts decides."""
+    run, parts = facts.run, scenarios_of(facts.run)
+    if len(parts) == 1 or evidence.missing:
+        return decide(evidence)
+    ends = [*(k for k, _ in parts[1:]), int(run.k[-1]) + 1]
+    found = []
+    for (begin, scenario), end in zip(parts, ends, strict=True):
+        rows = slice(*np.searchsorted(run.k, (begin, end)))
+        part = RunFacts(replace(run.part(rows), scenario=scenario, parameter_changes=()))
+        word = decide(evidence_of_run(part, judgements_of(part)))
+        where = f"parameters were changed, and from {begin * run.ts:g} s to {end * run.ts:g} s"
+        found.append(replace(word, reason=f"{where}: {word.reason}"))
+    return weakest(found)
+
+
 def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
-    """Of a run, with what each criterion says of it."""
+    """Of a run, with what each criterion says of it; of one whose parameters were changed with those of its beginning.
+
+    Raises PartError if a part raises.
+    """
     run, missing = facts.run, sum(facts.run.unexplained.values())
     common = Evidence(
         n=facts.n, v_max=run.scenario.controller.v_max, infeasible=facts.infeasible, missing=missing
@@ -47,15 +69,27 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
     if not facts.is_feasible or missing:
         return common
     repeated = repeated_run(run, facts.loop)
-    common = dataclasses.replace(common, repeated=repeated, contradictions=tuple(_contradictions(run, repeated)))
+    common = replace(common, repeated=repeated, contradictions=tuple(_contradictions(run, repeated)))
     if facts.is_late:
         return _of_late_messages(common, run, judgements)
-    growth, both = judgements["mean_square"].detail
     if run.downlink_lost.any():
-        return _of_both_links(common, run, both)
+        return _of_both_links(common, facts, judgements)
     n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
-    burst_left = _burst_left(facts.fit, growth, facts.loop)
-    return dataclasses.replace(common, n_bursts=n_bursts, growth=growth, burst_left=burst_left)
+    if _loses_nothing(run):
+        growth = float(judgements["mean_square"].detail[0])
+        return replace(common, n_bursts=n_bursts, growth=growth)
+    link = link_confidence(facts.loop, run.k, run.lost, run.ts)
+    return replace(
+        common, n_bursts=n_bursts, growth=link.growth, burst_left=_burst_left(facts.fit, link, facts.loop), link=link,
+        probability_stable=link.probability_stable,
+    )  # fmt: skip
+
+
+def _loses_nothing(run: Run) -> bool:
+    """Is it known that the uplink loses nothing, and not only seen? The relay passes everything on."""
+    uplink = run.scenario.relay.uplink
+    is_perfect = uplink.model == "perfect" and not uplink.schedule and not run.parameter_changes
+    return is_perfect and run.seed_known and not run.lost.any()
 
 
 def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evidence:
@@ -66,46 +100,77 @@ def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evid
     run = simulate(with_an_end(scenario))
     facts = RunFacts(run)
     found = evidence_of_run(facts, judgements_of(facts))
-    found = dataclasses.replace(found, twins=None if twins is None else (twins.contracting, len(twins.contraction)))
+    found = replace(found, twins=None if twins is None else (twins.contracting, len(twins.contraction)))
     uplink, downlink = chain_of(scenario.relay.uplink), chain_of(scenario.relay.downlink)
     if not facts.is_feasible or facts.is_late or uplink is None or downlink is None or downlink.loss_rate > 0.0:
         return found
     growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
-    is_random = bool(np.any((uplink.delivery > 0.0) & (uplink.delivery < 1.0)) or np.any(
-        (uplink.transition > 0.0) & (uplink.transition < 1.0)
-    ))  # fmt: skip
-    return dataclasses.replace(
-        found, growth=growth, probability_stable=1.0 if growth < 0.0 else 0.0, seen="", is_unlimited=is_random,
-        burst_left=None,
+    return replace(
+        found, growth=growth, probability_stable=1.0 if growth < 0.0 else 0.0, link=None,
+        is_unlimited=_is_random(uplink), burst_left=None,
     )  # fmt: skip
+
+
+def _is_random(chain: Chain) -> bool:
+    chances = np.concatenate((chain.transition.ravel(), chain.delivery))
+    return bool(np.any((chances > 0.0) & (chances < 1.0)))
 
 
 def _of_late_messages(common: Evidence, run: Run, judgements: Mapping[str, Judgement]) -> Evidence:
     delay = _constant_delay(run)
-    if delay is None:
-        why = "messages were late, by no constant delay, which no criterion covers"
-        return dataclasses.replace(common, not_covered=why)
-    return dataclasses.replace(common, late_by=delay, lifted_radius=judgements["lifted"].detail)
-
-
-def _of_both_links(common: Evidence, run: Run, growth: float | None) -> Evidence:
-    if growth is None:
-        policy = run.scenario.plant.downlink_policy
-        why = f"commands were lost, and no criterion covers downlink policy {policy}"
-        return dataclasses.replace(common, not_covered=why)
-    return dataclasses.replace(common, growth=growth, growth_of="both_links")
+    if delay is not None:
+        return replace(common, late_by=delay, lifted_radius=judgements["lifted"].detail)
+    late = judgements.get("late_and_lost")
+    if late is not None and not run.is_late:
+        return replace(common, growth=late.detail, growth_of="late_and_lost")
+    why = "messages were late, by no constant delay, which no criterion covers"
+    if run.is_late:
+        why = "poses or commands came later than their slots say, which no criterion covers"
+    of_ages = judgements["recorded_losses"].stable
+    if of_ages is not None:
+        why += f"; under these very ages a small error {'shrinks' if of_ages else 'grows'}"
+    return replace(common, not_covered=why)
 
 
 def _constant_delay(run: Run) -> int | None:
     """Age of the pose in slots, if it is always the same, but for the beginning, and commands are there at once."""
-    n = int(run.n_ul.max())
+    n = int(run.command_age.max())
     is_direct = not (run.downlink_lost.any() or has_late(run.downlink))
-    return n if is_direct and np.array_equal(run.n_ul, np.minimum(run.k, n)) else None
+    return n if is_direct and np.array_equal(run.command_age, np.minimum(run.k, n)) else None
 
 
-def _burst_left(fit: ChannelFit, growth: float, loop: LinearLoop) -> float | None:
-    """By what factor the mean burst may grow at the fitted loss rate; None for a fit without bursts."""
-    if fit.model != "gilbert_elliott" or growth >= 0.0 or fit.chain.loss_rate >= 1.0:
+def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
+    """Sure is what holds at both ends of the intervals of the fitted channels."""
+    run, (_, growth) = facts.run, judgements["mean_square"].detail
+    policy = run.scenario.plant.downlink_policy
+    if growth is None:
+        why = f"commands were lost, and no criterion covers downlink policy {policy}"
+        return replace(common, not_covered=why)
+    fits = facts.fit, facts.downlink_fit
+
+    def growth_at(end: int) -> float:
+        links = joint_chain.independent(*(_at_end(fit, end) for fit in fits))
+        return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
+
+    is_sure = growth_at(-1 if growth < 0.0 else 0) * growth > 0.0
+    return replace(
+        common, growth=growth, growth_of="both_links",
+        probability_stable=(1.0 if growth < 0.0 else 0.0) if is_sure else 0.5,
+        seen="" if is_sure else "too few outages of both links were seen",
+    )  # fmt: skip
+
+
+def _at_end(fit: ChannelFit, end: int) -> Chain:
+    """The fitted channel at the better end of its intervals (0), or at the worse one (-1)."""
+    p = 0.0 if fit.p is None else (fit.p.low, fit.p.high)[end]
+    r = 1.0 if fit.r is None else (fit.r.high, fit.r.low)[end]
+    return gilbert_elliott(p, max(r, 1e-6))
+
+
+def _burst_left(fit: ChannelFit, link: LinkConfidence, loop: LinearLoop) -> float | None:
+    """By what factor the mean burst may grow at the fitted loss rate; None where no such channel describes the link."""
+    is_described = fit.model == "gilbert_elliott" and fit.goodness.fits and len(link.segments) == 1
+    if not is_described or link.growth >= 0.0 or fit.chain.loss_rate >= 1.0:
         return None
     critical = mean_square.critical_burst(loop, fit.chain.loss_rate)
     return critical / fit.mean_burst if np.isfinite(critical) else None
@@ -113,6 +178,9 @@ def _burst_left(fit: ChannelFit, growth: float, loop: LinearLoop) -> float | Non
 
 def _contradictions(run: Run, repeated: RepeatedRun | None) -> Iterator[str]:
     """How a recording contradicts what is known of the loop."""
+    driven = driven_commands(run)
+    if driven.differs:
+        yield driven.sentence
     plant = run.scenario.plant
     if repeated is None or plant.slip_noise > 0.0 or not math.isfinite(repeated.largest_in_run):
         return

@@ -180,7 +180,7 @@ def _under_losses(run: Run, reference: Floats, start: Loop, count: int) -> Float
     inputs = RunInputs(numbers(lost), numbers(downlink_lost), start, settings_of(run.scenario))
     if not _is_late(run):
         return _direct(run.scenario, reference, inputs)
-    up, down = (_link(age, count) for age in (run.n_ul, _downlink_ages(run)))
+    up, down = (_link(age, count) for age in (_uplink_ages(run), _downlink_ages(run)))
     traces, rows = (empty_trace(len(lost)), empty_trace(len(lost))), np.full((len(lost), 8), math.nan)
     parts = replacements_of(run.scenario)
     run_parts(history_over_links, parts, numbers(reference), inputs, up, down, *traces, rows)
@@ -203,10 +203,15 @@ def _does_not_grow(before: float, last: float) -> bool:
 
 
 def _is_late(run: Run) -> bool:
-    """Does the age of what the receivers hold differ from what the outcomes of the slots say?"""
-    first = int(run.k[0])
-    up, down = (_ages_of(lost, first) for lost in (run.lost, run.downlink_lost))
-    return not (np.array_equal(run.n_ul, up) and np.array_equal(_downlink_ages(run), down))
+    """Is what the receivers hold older than the outcomes of the slots say?"""
+    first, since = int(run.k[0]), np.arange(len(run))
+    pairs = (_uplink_ages(run), run.lost), (_downlink_ages(run), run.downlink_lost)
+    return any(not np.array_equal(np.minimum(age, since), _ages_of(lost, first)) for age, lost in pairs)
+
+
+def _uplink_ages(run: Run) -> NDArray[np.int64]:
+    """Of a run whose messages came later than their slots say the whole age of what acted."""
+    return run.command_age
 
 
 def _ages_of(lost: NDArray[np.bool_], first: int) -> NDArray[np.int64]:

@@ -23,8 +23,10 @@ it: a run that is short, or ends inside an outage, may have a multiplier above 1
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from agv_analysis.stability.link_confidence import LinkConfidence
 from agv_analysis.stability.repeated_run import RepeatedRun
 
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
@@ -37,6 +39,8 @@ INFEASIBLE = "infeasible"
 
 GREEN = (ASYMPTOTIC, MEAN_SQUARE)
 """Words that say that a loop is stable."""
+
+_FROM_STRONGEST = (ASYMPTOTIC, MEAN_SQUARE, UNDECIDED, UNKNOWN, BOUNDED, UNSTABLE, INFEASIBLE)
 
 SURE = 0.95
 """A green word needs at least this probability of a stable loop, `unstable` at most 1 less this."""
@@ -79,10 +83,10 @@ class Evidence:
     """Spectral radius of the lifted system for `late_by`."""
     probability_stable: float = 1.0
     """Of a stable loop, given the losses that were seen; 1 or 0 where the channel is known."""
-    seconds_more: float | None = None
-    """How much longer to record [s] for a decision; None: unknown, or it would not help."""
+    link: LinkConfidence | None = None
+    """What the recorded outcomes say of the loop, and how surely; None where the link is known or was not judged."""
     seen: str = ""
-    """What was seen of the link, in a sentence."""
+    """Why nothing is sure, where there is no `link` that says so."""
     v_max: float = math.inf
     """Limit on the speed [m/s]."""
     infeasible: str = ""
@@ -114,6 +118,11 @@ def decide(evidence: Evidence) -> Verdict:
     return word
 
 
+def weakest(verdicts: Sequence[Verdict]) -> Verdict:
+    """The worst of several verdicts, the first of its kind."""
+    return max(verdicts, key=lambda verdict: _FROM_STRONGEST.index(verdict.word))
+
+
 def _by_criteria(evidence: Evidence) -> Verdict:
     """The word by the linear criteria and by how much was seen of the link."""
     if evidence.late_by is not None:
@@ -129,14 +138,15 @@ def _by_criteria(evidence: Evidence) -> Verdict:
         left = "any number of" if evidence.n_bursts is None else str(evidence.n_bursts - evidence.n)
         plural = "s" if left != "1" else ""
         reason = f"any sequence of outages of up to {evidence.n} slots is survived"
-        return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{plural}", _with_seen(reason, evidence))
+        sure = f"; {_of_link(evidence)}" if evidence.link is not None else ""
+        return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{plural}", reason + sure)
     if evidence.growth < 0.0:
         return _mean_square(evidence)
     return _not_stable(evidence, evidence.growth_of, _grows(evidence))
 
 
 def _mean_square(evidence: Evidence) -> Verdict:
-    reason = _with_seen("under this link the mean square of the error dies out", evidence)
+    reason = _of_link(evidence) or "under this link the mean square of the error dies out"
     if evidence.growth_of == "both_links":
         margin = "commands were lost as well; under both links the mean square of the error dies out"
     elif evidence.growth_of != "mean_square":
@@ -157,10 +167,12 @@ def _late(evidence: Evidence) -> Verdict:
 
 
 def _undecided(evidence: Evidence) -> Verdict:
-    reason = evidence.seen or f"a stable loop is {evidence.probability_stable:.0%} probable"
-    more = evidence.seconds_more
-    longer = "" if more is None else f"; record about {more:.3g} s more"
-    return Verdict(UNDECIDED, "confidence", f"unknown: {reason}{longer}", f"{reason}{longer}")
+    reason = _of_link(evidence) or evidence.seen or f"a stable loop is {evidence.probability_stable:.0%} probable"
+    return Verdict(UNDECIDED, "confidence", f"unknown: {reason}", reason)
+
+
+def _of_link(evidence: Evidence) -> str:
+    return "" if evidence.link is None else evidence.link.reason
 
 
 def _not_stable(evidence: Evidence, criterion: str, why: str) -> Verdict:
@@ -180,9 +192,13 @@ def _grows(evidence: Evidence) -> str:
         return "commands are lost as well, and under both links the mean square of the error grows"
     if evidence.growth_of != "mean_square":
         return "messages are late, and under ages like these the mean square of the error grows"
+    if evidence.link is not None:
+        return evidence.link.reason
     grows = "under this link the mean square of the error grows"
     is_survived = evidence.n_bursts is None or evidence.n <= evidence.n_bursts
-    return _with_seen(grows if is_survived or evidence.is_unlimited else f"{_beyond(evidence)}, and {grows}", evidence)
+    if evidence.n_bursts is not None and evidence.n_bursts < 0:
+        return "a small error grows even without losses"
+    return grows if is_survived or evidence.is_unlimited else f"{_beyond(evidence)}, and {grows}"
 
 
 def _beyond(evidence: Evidence) -> str:
@@ -193,19 +209,17 @@ def _beyond(evidence: Evidence) -> str:
     return f"the longest outage exceeds what any sequence of outages may have by {evidence.n - evidence.n_bursts}"
 
 
-def _with_seen(reason: str, evidence: Evidence) -> str:
-    return f"{reason}; {evidence.seen}" if evidence.seen else reason
-
-
 def against_stability(evidence: Evidence) -> str:
     """What the simulation of the nonlinear loop says against a stable one; empty if nothing."""
     repeated, twins = evidence.repeated, evidence.twins
     if repeated is not None:
-        near = f"; after {repeated.seconds:.0f} s it is still up to {repeated.largest_deviation:.3g} m off"
         if not repeated.settles:
-            return f"simulated without any loss the loop does not settle on its nominal motion{near}"
+            return "simulated without any loss the loop does not settle on its nominal motion"
         if not repeated.stays:
-            return "simulated under these losses again and again the deviation grows" + near
+            return (
+                "simulated under these losses again and again the deviation grows, to "
+                f"{repeated.largest_deviation:.3g} m after {repeated.seconds:.0f} s"
+            )
         if not repeated.meets:
             return "simulated under these losses, an AGV that begins on the track and this one do not come together"
     if twins is not None and twins[0] < _SURE_OF_RUNS * twins[1]:

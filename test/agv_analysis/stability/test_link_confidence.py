@@ -191,7 +191,7 @@ def drift(first: float, last: float) -> Callable[[np.random.Generator], Outcomes
 
 def blocked_and_fading(rng: np.random.Generator) -> Outcomes:
     """Gilbert p = 0.001, r = 0.01, and independent losses of 5 % beside it."""
-    return gilbert(0.001, 0.01, 20_000, 1, int(rng.integers(1 << 30)))[0] | (rng.random(20_000) < 0.05)
+    return np.asarray(gilbert(0.001, 0.01, 20_000, 1, int(rng.integers(1 << 30)))[0] | (rng.random(20_000) < 0.05))
 
 
 @pytest.mark.no_cover
