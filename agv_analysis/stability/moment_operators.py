@@ -7,6 +7,7 @@ duplication matrices: Magnus and Neudecker, SIAM J. Alg. Disc. Meth. 1, 1980). n
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from agv_analysis.stability.linear_loop import LinearLoop
 
 _POINTS, _POINTS_OF_LARGE = 8, 4
 """Places of a lap at which a loop is looked at, of up to three states and of more."""
+
+_LEAST_RADIUS = math.exp(-700.0)
+"""Put in for nilpotent matrices, so that means and differences of logarithms stay finite."""
 
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
@@ -50,6 +54,5 @@ def leading_entries(size: int, part: int) -> NDArray[np.int64]:
 
 
 def log_radius(operators: Floats) -> Floats:
-    """Logarithm of the spectral radius of each of a stack of matrices, shape (..., n, n); -inf for nilpotent ones."""
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.abs(np.linalg.eigvals(operators)).max(axis=-1)))
+    """Logarithm of the spectral radius of each of a stack of matrices, shape (..., n, n); at least -700."""
+    return np.asarray(np.log(np.maximum(np.abs(np.linalg.eigvals(operators)).max(axis=-1), _LEAST_RADIUS)))

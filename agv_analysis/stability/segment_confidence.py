@@ -37,7 +37,7 @@ _LONGEST = 300.0
 
 _HEAVY = "the longest outages are so long beside the others that their mean square may not exist"
 
-_ADVANTAGE = 1.0
+_ADVANTAGE = 2.0
 """Log likelihood by which a heavy tail must be the likelier where geometric outages are not rejected."""
 
 _FEW = 5

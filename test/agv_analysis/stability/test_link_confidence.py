@@ -186,12 +186,18 @@ def pareto(p: float, alpha: float) -> Callable[[np.random.Generator], Outcomes]:
 
 def drift(first: float, last: float) -> Callable[[np.random.Generator], Outcomes]:
     p = np.linspace(first, last, 20_000)
-    return lambda rng: rng.random(20_000) < p
+
+    def outcomes(rng: np.random.Generator) -> Outcomes:
+        lost: Outcomes = rng.random(20_000) < p
+        return lost
+
+    return outcomes
 
 
 def blocked_and_fading(rng: np.random.Generator) -> Outcomes:
     """Gilbert p = 0.001, r = 0.01, and independent losses of 5 % beside it."""
-    return np.asarray(gilbert(0.001, 0.01, 20_000, 1, int(rng.integers(1 << 30)))[0] | (rng.random(20_000) < 0.05))
+    lost: Outcomes = gilbert(0.001, 0.01, 20_000, 1, int(rng.integers(1 << 30)))[0] | (rng.random(20_000) < 0.05)
+    return lost
 
 
 @pytest.mark.no_cover
@@ -267,6 +273,16 @@ def test_a_loop_that_is_unstable_without_losses_is_never_green() -> None:
     """K_x = 450: a = 2.25."""
     for lost in (np.zeros(2000, dtype=bool), gilbert(0.01, 0.1, 2000, 1, seed=0)[0]):
         assert judge(lost, line(kx=450.0)).worst.word == "unstable"
+
+
+@pytest.mark.parametrize("p", [0.0, 0.01, 0.5])
+def test_a_deadbeat_loop(p: float) -> None:
+    """K_x = 200 along the track alone: one reception brings the error to 0; stable up to p = 1/3."""
+    lost = np.random.default_rng(0).random(5000) < p
+    loop = kanayama_loop(np.zeros(1), np.zeros(1), ControllerParameters(kx=200.0, ky=1.0, ktheta=2.0), TS)
+    found = judge(lost, loop)
+    assert math.isfinite(found.growth)
+    assert (found.worst.word == "unstable") == (p > 1 / 3)
 
 
 def test_losses_leave_nothing_behind_an_exact_predictor() -> None:
