@@ -227,6 +227,20 @@ def test_an_edge_that_answers_when_the_poses_come_has_late_commands_of_the_same_
     assert run.is_late
 
 
+def test_a_recorder_behind_the_same_connection_hears_the_agv_as_late_as_the_edge_does(tmp_path: Path) -> None:
+    """Also where only the end of the recording shows how early a message can come."""
+    late: dict[str, Delay] = dict.fromkeys(ON_THE_WAY, burst)
+    run = read_run(write(tmp_path / "bag", simulated(1190), late)[0])
+    assert run.is_late
+    assert run.command_age.max() in (998, 999, 1000)
+
+
+def test_log_times_of_a_bag_that_was_written_in_one_go_say_nothing(tmp_path: Path) -> None:
+    run = read_run(write(tmp_path / "bag", simulated(400), log_time=lambda stamp, topic: OFFSET + stamp // 50)[0])
+    assert run.n_ul_received is None
+    assert "log times last less than a twentieth of what the stamps do" in notes_of(run)
+
+
 def late_by(steps: Mapping[int, float]) -> Delay:
     return lambda k: 5.0 * steps.get(k, 0.0)
 
