@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli
 from agv_analysis.run import Floats
-from agv_analysis.stability.borders import borders, crossing
+from agv_analysis.stability.first_border import borders, crossing
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.products import orthogonalised_pass
 from agv_analysis.stability.reception_maps import reception_maps

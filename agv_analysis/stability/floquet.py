@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
-from agv_analysis.stability.borders import last_stable
+from agv_analysis.stability.first_border import last_stable
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radius
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import assign, divide, growths, largest_entry, multiply
@@ -195,7 +195,7 @@ def largest_constant_delay(loop: LinearLoop, limit: int = 10_000) -> int | None:
     """Largest n up to which every constant delay lets the lap contract; -1: not even 0, None: all up to `limit` do.
 
     The closed forms for a straight track at the mean speed say where to look, if there are any. Longer delays may be
-    stable again, see `borders.stable_again`.
+    stable again, see `first_border.stable_again`.
     """
     guess = 0.0
     if not loop.predicts and loop.along_gain is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from agv_analysis.run import Floats
 from agv_analysis.stability import floquet
-from agv_analysis.stability.borders import last_stable
+from agv_analysis.stability.first_border import last_stable
 from agv_analysis.stability.kanayama_delay import critical_delay_across, critical_delay_along, spectral_radii
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_cloud.parameters import ControllerParameters

@@ -26,7 +26,7 @@ import numpy as np
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.run import Floats
-from agv_analysis.stability.borders import borders
+from agv_analysis.stability.first_border import borders
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.products import assign, divide, multiply
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable
 import numpy as np
 
 from agv_analysis.stability import floquet, lifted
-from agv_analysis.stability.borders import stable_again
 from agv_analysis.stability.criteria.criterion import (
     Criterion,
     Judgement,
@@ -20,6 +19,7 @@ from agv_analysis.stability.criteria.criterion import (
     finite,
     steps_text,
 )
+from agv_analysis.stability.first_border import stable_again
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margin_map_points import LIMIT, largest_delays
 

@@ -9,7 +9,6 @@ from agv_analysis.link import joint_chain
 from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import mean_square, mean_square_two_links
-from agv_analysis.stability.borders import not_monotone
 from agv_analysis.stability.criteria.criterion import (
     Border,
     Criterion,
@@ -21,6 +20,7 @@ from agv_analysis.stability.criteria.criterion import (
     finite,
     growth_text,
 )
+from agv_analysis.stability.first_border import not_monotone
 from agv_analysis.stability.scenario_loop import straight_loop_of
 
 NOT_MET = "not met: the error does not contract even without losses"

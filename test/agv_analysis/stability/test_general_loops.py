@@ -16,7 +16,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.run import Floats
 from agv_analysis.stability import (
     almost_sure,
-    borders,
+    first_border,
     floquet,
     joint_spectral_radius,
     lifted,
@@ -87,9 +87,9 @@ def test_the_largest_delay_is_the_last_whose_radius_is_below_one(loop: LinearLoo
 
 @pytest.mark.parametrize("limit", [10, 11, 12, 13, 100])
 def test_a_search_knows_all_up_to_its_limit(limit: int) -> None:
-    assert borders.last_stable(lambda n: n <= 12, 3.0, limit) == (12 if limit > 12 else None)
-    assert borders.last_stable(lambda n: n <= 12, 30.0, 100) == 12
-    assert borders.last_stable(lambda n: False, 3.0, limit) == -1
+    assert first_border.last_stable(lambda n: n <= 12, 3.0, limit) == (12 if limit > 12 else None)
+    assert first_border.last_stable(lambda n: n <= 12, 30.0, 100) == 12
+    assert first_border.last_stable(lambda n: False, 3.0, limit) == -1
 
 
 def predicted_delay(n: int, F: Floats, G: Floats, delta: float) -> tuple[Floats, Floats]:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_elliott
-from agv_analysis.stability.borders import crossing
+from agv_analysis.stability.first_border import crossing
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.mean_square import (
     along_spectral_radius,

@@ -12,7 +12,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, bursty
 from agv_analysis.run import Floats
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability import floquet, lifted, mean_square
-from agv_analysis.stability.borders import borders, last_stable, not_monotone, spread, stable_again
+from agv_analysis.stability.first_border import borders, last_stable, not_monotone, spread, stable_again
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.margins import margins
 from agv_cloud.parameters import ControllerParameters
