@@ -177,6 +177,6 @@ def _rows_of(value: _Rows, steps: int, rows: slice) -> _Rows:
         inner = getattr(value, field_.name)
         if isinstance(inner, np.ndarray) and len(inner) == steps:
             found[field_.name] = inner[rows]
-        elif isinstance(inner, (LinkSlots, Timing)):
+        elif isinstance(inner, LinkSlots) or isinstance(inner, Timing):
             found[field_.name] = _rows_of(inner, steps, rows)
     return replace(value, **found)

@@ -28,7 +28,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_
 from agv_analysis.run import Floats
 from agv_analysis.stability.first_border import borders
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
-from agv_analysis.stability.products import assign, divide, multiply
+from agv_analysis.stability.products import assign, divide, log_spectral_radius, multiply
 
 _LAPS = 40
 
@@ -114,12 +114,17 @@ def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, s
     """Growth (logarithm) of the second moments over a lap.
 
     By driving laps until the growth settles; `moments` are those to begin with, and are left as they settled, which
-    makes the next call with a similar chain faster. `settled`: as of `settled_growth`.
+    makes the next call with a similar chain faster. Without losses it is twice that of the state itself. `settled`: as
+    of `settled_growth`.
     """
     if loop.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
         chain, moments = bernoulli(0.0), None
     if loop.is_constant and len(chain.delivery) * (loop.size + loop.outputs) ** 2 <= _LARGEST:
         return loop.steps * math.log(spectral_radius(*step_maps(loop), chain))
+    if chain.loss_rate == 0.0:  # X(k+1) = A_1 X(k) A_1': eigenvalues are products of two of those of the lap of A_1
+        received = loop.F.copy()
+        received[:, :, : loop.outputs] += loop.G
+        return 2.0 * log_spectral_radius(received) * (loop.steps / len(received))
     if moments is None:
         moments = Moments.unit(loop, len(chain.delivery))
     return settled_growth(loop, moments, moments.size, _drive(loop, chain, moments), settled)

@@ -64,6 +64,22 @@ def moments_by_enumeration(F: Floats, G: Floats, chain: Chain, steps: int) -> Fl
     return total
 
 
+@pytest.mark.parametrize(("kx", "ky", "ktheta"), [(25.0, 1.0, 2.0), (5.0, 30.0, 1.0), (401.0, 1.0, 2.0)])
+def test_without_losses_it_is_the_square_of_the_error_s_own_growth(
+    lap: Lap, kx: float, ky: float, ktheta: float
+) -> None:
+    """The product of a lap's F + G, step by step; the first two have a complex pair, whose size never settles."""
+    _, v_r, w_r = lap("paper", 2000)
+    loop = kanayama_loop(v_r, w_r, ControllerParameters(kx=kx, ky=ky, ktheta=ktheta), TS)
+    product, log_scale = np.eye(3), 0.0
+    for F, G in zip(loop.F, loop.G, strict=True):
+        product = (F + G) @ product
+        log_scale, product = log_scale + math.log(np.abs(product).max()), product / np.abs(product).max()
+    growth = log_scale + math.log(np.abs(np.linalg.eigvals(product)).max())
+    assert lap_growth(loop, bernoulli(0.0)) == pytest.approx(2.0 * growth, rel=1e-9)
+    assert lap_growth(loop, bernoulli(1e-9)) == pytest.approx(2.0 * growth, rel=5e-3)  # a mean of laps
+
+
 @pytest.mark.parametrize(
     ("chain", "steps"),
     [(bernoulli(0.4), 9), (gilbert_elliott(0.2, 0.5), 5), (gilbert_elliott(0.1, 0.3, 0.2, 0.9), 5)],
