@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from agv_analysis.scenario import Scenario
 
 Floats = NDArray[np.float64]
-
-_Rows = TypeVar("_Rows", "Run", "LinkSlots", "Timing")
 
 
 @dataclass(frozen=True)
@@ -167,16 +165,17 @@ class Run:
 
     def part(self, rows: slice) -> Run:
         """The run over some of its steps."""
-        return _rows_of(self, len(self), rows)
+        found: Run = _rows_of(self, len(self), rows)
+        return found
 
 
-def _rows_of(value: _Rows, steps: int, rows: slice) -> _Rows:
+def _rows_of(value: Any, steps: int, rows: slice) -> Any:
     """A dataclass with those rows of each array of it that has a row a step."""
     found: dict[str, Any] = {}
     for field_ in fields(value):
         inner = getattr(value, field_.name)
         if isinstance(inner, np.ndarray) and len(inner) == steps:
             found[field_.name] = inner[rows]
-        elif isinstance(inner, LinkSlots) or isinstance(inner, Timing):
+        elif isinstance(inner, (LinkSlots, Timing)):
             found[field_.name] = _rows_of(inner, steps, rows)
     return replace(value, **found)
