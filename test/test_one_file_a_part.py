@@ -144,9 +144,7 @@ def agv_ncs(folder: Path, *arguments: str) -> str:
 
 @pytest.mark.no_cover
 @pytest.mark.parametrize("kind", PARTS)
-def test_one_new_file_is_a_part(copied: Path, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if kind != "channel":  # whether parts compile is asked elsewhere; here it would take most of the time
-        monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
+def test_one_new_file_is_a_part(copied: Path, kind: str, tmp_path: Path) -> None:
     file, source, settings, listed = PARTS[kind]
     assert not (copied / file).exists()
     (copied / file).write_text(source)
