@@ -25,7 +25,8 @@ _OF_GAINS = (
     "paper_stable", "paper_radius", "lifted_stable", "lifted_radius", "bursts_stable", "bursts_verdict",
     "bursts_radius_lower", "bursts_radius_upper", "mean_square_stable", "mean_square_growth",
     "floquet_multiplier_per_step", "contraction_per_step", "verdict", "verdict_criterion", "verdict_reason",
-    "margin", "feasible", "infeasible_reason", "nominal_notes",
+    "margin", "feasible", "infeasible_reason", "nominal_notes", "confidence", "growth_interval", "record_seconds_more",
+    "stationarity", "driven",
 )  # fmt: skip
 """Figures that nobody knows without the gains."""
 
@@ -177,12 +178,20 @@ class Analysis(Observations):
             )
         return found
 
+    def _of_known_link(self) -> dict[str, Any]:
+        """Where the link is known, or was not judged by its outcomes."""
+        evidence = self.evidence
+        is_judged = evidence.growth is not None or evidence.late_by is not None
+        return {"confidence": evidence.probability_stable if is_judged else None}
+
     def to_json(self) -> dict[str, Any]:
         """The figures by name, as `Observations.to_json`."""
         values = {name: value for found in self.judgements.values() for name, value in found.values.items()}
+        link = self.evidence.link
         return {
             **super().to_json(),
             **values,
+            **(self._of_known_link() if link is None else link.to_json()),
             "verdict": self.verdict.word,
             "verdict_criterion": self.verdict.criterion,
             "verdict_reason": self.verdict.reason,

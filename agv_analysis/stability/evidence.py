@@ -18,6 +18,7 @@ from agv_analysis.stability import joint_spectral_radius, mean_square, mean_squa
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import longest_for
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
+from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
 from agv_analysis.stability.driven_commands import driven_commands, scenarios_of
 from agv_analysis.stability.empirical import Twins, with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
@@ -71,7 +72,7 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
     repeated = repeated_run(run, facts.loop)
     common = replace(common, repeated=repeated, contradictions=tuple(_contradictions(run, repeated)))
     if facts.is_late:
-        return _of_late_messages(common, run, judgements)
+        return _of_late_messages(common, facts, judgements)
     if run.downlink_lost.any():
         return _of_both_links(common, facts, judgements)
     n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
@@ -116,13 +117,15 @@ def _is_random(chain: Chain) -> bool:
     return bool(np.any((chances > 0.0) & (chances < 1.0)))
 
 
-def _of_late_messages(common: Evidence, run: Run, judgements: Mapping[str, Judgement]) -> Evidence:
-    delay = _constant_delay(run)
+def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
+    run, delay = facts.run, _constant_delay(facts.run)
     if delay is not None:
         return replace(common, late_by=delay, lifted_radius=judgements["lifted"].detail)
     late = judgements.get("late_and_lost")
     if late is not None and not run.is_late:
-        return replace(common, growth=late.detail, growth_of="late_and_lost")
+        growth = late.detail
+        is_sure = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
+        return _with_growth(common, growth, "late_and_lost", "" if is_sure else "the halves of the run do not agree")
     why = "messages were late, by no constant delay, which no criterion covers"
     if run.is_late:
         why = "poses or commands came later than their slots say, which no criterion covers"
@@ -130,6 +133,12 @@ def _of_late_messages(common: Evidence, run: Run, judgements: Mapping[str, Judge
     if of_ages is not None:
         why += f"; under these very ages a small error {'shrinks' if of_ages else 'grows'}"
     return replace(common, not_covered=why)
+
+
+def _with_growth(common: Evidence, growth: float, growth_of: str, unsure: str) -> Evidence:
+    """With a growth that is sure, unless something speaks against it."""
+    probability = 0.5 if unsure else 1.0 if growth < 0.0 else 0.0
+    return replace(common, growth=growth, growth_of=growth_of, probability_stable=probability, seen=unsure)
 
 
 def _constant_delay(run: Run) -> int | None:
@@ -153,11 +162,8 @@ def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, J
         return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
 
     is_sure = growth_at(-1 if growth < 0.0 else 0) * growth > 0.0
-    return replace(
-        common, growth=growth, growth_of="both_links",
-        probability_stable=(1.0 if growth < 0.0 else 0.0) if is_sure else 0.5,
-        seen="" if is_sure else "too few outages of both links were seen",
-    )  # fmt: skip
+    unsure = "" if is_sure else "too few outages of both links were seen to say whether the mean square dies out"
+    return _with_growth(common, growth, "both_links", unsure)
 
 
 def _at_end(fit: ChannelFit, end: int) -> Chain:

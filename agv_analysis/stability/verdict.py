@@ -42,6 +42,9 @@ GREEN = (ASYMPTOTIC, MEAN_SQUARE)
 
 _FROM_STRONGEST = (ASYMPTOTIC, MEAN_SQUARE, UNDECIDED, UNKNOWN, BOUNDED, UNSTABLE, INFEASIBLE)
 
+SIMULATION = "simulation"
+"""The criterion of a word that the simulation of the nonlinear loop decided."""
+
 SURE = 0.95
 """A green word needs at least this probability of a stable loop, `unstable` at most 1 less this."""
 
@@ -114,7 +117,7 @@ def decide(evidence: Evidence) -> Verdict:
     word = _by_criteria(evidence)
     against = against_stability(evidence)
     if word.word in (*GREEN, UNDECIDED) and against:
-        return _not_stable(evidence, "simulation", against)
+        return _not_stable(evidence, SIMULATION, against)
     return word
 
 
@@ -184,7 +187,9 @@ def _not_stable(evidence: Evidence, criterion: str, why: str) -> Verdict:
         f"only the limit on the speed bounds the error, at {repeated.largest_deviation:.3g} m in "
         f"{repeated.seconds:.0f} s of simulation"
     )
-    return Verdict(BOUNDED, "v_max", f"none: {why}; {only}", f"{why}; {only}")
+    return Verdict(
+        BOUNDED, SIMULATION if criterion == SIMULATION else "v_max", f"none: {why}; {only}", f"{why}; {only}"
+    )
 
 
 def _grows(evidence: Evidence) -> str:

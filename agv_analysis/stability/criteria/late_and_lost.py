@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from agv_analysis.link.age_chain import AgeChain, age_chain_of, fitted_ages
 from agv_analysis.stability import delayed_mean_square
 from agv_analysis.stability.criteria.criterion import (
@@ -18,6 +20,9 @@ from agv_analysis.stability.criteria.criterion import (
 )
 from agv_analysis.stability.linear_loop import LinearLoop
 
+_PLACES = 2000
+"""Places of a lap, at least, where a run is judged; all of them would take several seconds."""
+
 _NAME, _LABEL = "late_poses.mean_square_growth", "Late and lost poses as they are, mean square"
 
 
@@ -31,8 +36,24 @@ def growth_of_late_poses(facts: RunFacts) -> float | None:
         return None
     if len(run) < 2 or int(run.k[-1] - run.k[0]) + 1 != len(run):
         return None
-    ages = fitted_ages(run.n_ul)
-    return None if _why_not(facts.loop, ages) else delayed_mean_square.lap_growth(facts.loop, ages) / len(run)
+    return _growth(facts, slice(None))
+
+
+def growths_of_halves(facts: RunFacts) -> tuple[float | None, float | None]:
+    """The same under the chains fitted to either half of a run: where they differ in sign the run shows too little."""
+    half = len(facts.run) // 2
+    return _growth(facts, slice(0, half)), _growth(facts, slice(half, None))
+
+
+def _growth(facts: RunFacts, rows: slice) -> float | None:
+    ages, loop = fitted_ages(facts.run.n_ul[rows]), _thinned(facts.loop)
+    return None if _why_not(loop, ages) else delayed_mean_square.lap_growth(loop, ages) / loop.steps
+
+
+def _thinned(loop: LinearLoop) -> LinearLoop:
+    """The loop at so many places of its lap that the growth per step is the same, but not at all of them."""
+    stride = max(1, loop.steps // _PLACES)
+    return loop if loop.is_constant or stride == 1 else loop.at(np.arange(0, loop.steps, stride))
 
 
 def _why_not(loop: LinearLoop, ages: AgeChain) -> str:

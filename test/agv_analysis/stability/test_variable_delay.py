@@ -64,11 +64,11 @@ def test_it_is_the_growth_between_twins_on_a_straight_track(jitter: float, kx: f
     assert age_sequence(loop, one.n_ul[:steps]) == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_run_with_jitter_has_its_multiplier_and_no_word() -> None:
+def test_a_run_with_jitter_has_its_multiplier_and_the_word_of_its_ages() -> None:
     settings = ["relay.uplink.delay=0.02", "relay.uplink.jitter=0.01", "plant.duration=20.0"]
     found = analyse(simulate(load_scenario("config/paper.yaml", settings)))
     assert found.floquet is not None
     assert 0.9 < found.floquet < 1.0
-    assert (found.contraction, found.verdict.word) == (None, "unknown")
+    assert (found.contraction, found.verdict.word, found.verdict.criterion) == (None, "mean-square", "late_and_lost")
     both = analyse(simulate(load_scenario("config/paper.yaml", [*settings, "relay.downlink.delay=0.01"])))
-    assert both.floquet is None
+    assert (both.floquet, both.verdict.word) == (None, "unknown")

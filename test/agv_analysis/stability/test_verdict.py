@@ -115,7 +115,7 @@ GREEN_SO_FAR = Evidence(n=10, n_bursts=14, growth=-0.1, repeated=STAYS)
         ({"missing": 3}, "unknown", "3 messages are missing"),
         ({"infeasible": "it falls behind"}, "infeasible", "it falls behind"),
         ({"contradictions": ("driven with K_x = 50",)}, "unknown", "driven with K_x = 50"),
-        ({"probability_stable": 0.94, "seconds_more": 30.0}, "undecided", "record about 30 s more"),
+        ({"probability_stable": 0.94}, "undecided", "a stable loop is 94% probable"),
         ({"probability_stable": 0.5, "seen": "one outage"}, "undecided", "one outage"),
         ({"probability_stable": 0.04}, "unstable", "mean square"),
         ({"repeated": DRIFTS}, "unstable", "deviation grows"),
