@@ -192,6 +192,7 @@ class Analysis(Observations):
             **super().to_json(),
             **values,
             **(self._of_known_link() if link is None else link.to_json()),
+            "driven": None if self.evidence.driven is None else self.evidence.driven.to_json(),
             "verdict": self.verdict.word,
             "verdict_criterion": self.verdict.criterion,
             "verdict_reason": self.verdict.reason,

@@ -19,7 +19,7 @@ from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import longest_for
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
 from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
-from agv_analysis.stability.driven_commands import driven_commands, scenarios_of
+from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
 from agv_analysis.stability.empirical import Twins, with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.link_confidence import LinkConfidence, link_confidence
@@ -69,8 +69,9 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
     )  # fmt: skip
     if not facts.is_feasible or missing:
         return common
-    repeated = repeated_run(run, facts.loop)
-    common = replace(common, repeated=repeated, contradictions=tuple(_contradictions(run, repeated)))
+    driven, repeated = driven_commands(run), repeated_run(run, facts.loop)
+    contradictions = tuple(_contradictions(run, driven, repeated))
+    common = replace(common, driven=driven, repeated=repeated, contradictions=contradictions)
     if facts.is_late:
         return _of_late_messages(common, facts, judgements)
     if run.downlink_lost.any():
@@ -182,13 +183,17 @@ def _burst_left(fit: ChannelFit, link: LinkConfidence, loop: LinearLoop) -> floa
     return critical / fit.mean_burst if np.isfinite(critical) else None
 
 
-def _contradictions(run: Run, repeated: RepeatedRun | None) -> Iterator[str]:
-    """How a recording contradicts what is known of the loop."""
-    driven = driven_commands(run)
+def _contradictions(run: Run, driven: DrivenCommands, repeated: RepeatedRun | None) -> Iterator[str]:
+    """How a recording contradicts what is known of the loop, or leaves out what a judgement needs."""
+    plant, timing = run.scenario.plant, run.timing
     if driven.differs:
         yield driven.sentence
-    plant = run.scenario.plant
-    if repeated is None or plant.slip_noise > 0.0 or not math.isfinite(repeated.largest_in_run):
+    if timing is not None and timing.unknown and timing.missed_deadlines:
+        yield f"{timing.missed_deadlines} deadlines were missed, and how old the commands were by then is not known"
+    if repeated is None:
+        yield "steps are missing from the recording, so that the loop cannot be simulated under its losses"
+        return
+    if plant.slip_noise > 0.0 or not math.isfinite(repeated.largest_in_run):
         return
     later = slice(len(run) // 2, None)
     recorded = float(np.hypot(*(run.pose - run.reference[:, :3])[later, :2].T).max())

@@ -88,7 +88,7 @@ class LinkConfidence:
         }[worst.word]
         more = self.record_seconds_more
         longer = "" if more is None else f"; about {more:g} s more of the like would decide it"
-        return f"{where}{said} (probability {worst.probability_stable:.3g} that it does): {worst.why}{longer}"
+        return f"{where}{said}: {worst.why} (it dies out with probability {worst.probability_stable:.3g}){longer}"
 
     def to_json(self) -> dict[str, Any]:
         """`confidence`, `growth_interval`, `record_seconds_more`, `stationarity`, and the segments."""

@@ -5,7 +5,7 @@ functions that the nodes call, for as many repetitions of the run's track and lo
 
 - without losses, from where the run began: does it come to its nominal motion?
 - with the losses, from where the run began and from the reference: do the two AGVs come together?
-- with the losses: does the largest deviation grow from one repetition to the next?
+- with the losses: does the largest deviation grow from one third of the time to the next?
 
 Measurement noise and slip are left out: what a loop forgets does not depend on them.
 """
@@ -54,8 +54,8 @@ _APART = 1e-3
 _SHRINKING = 0.9
 """A distance that is below this share of what it was half the time before goes on shrinking."""
 
-_GROWING = 1.3
-"""A largest deviation above this multiple of the one a repetition before is growing."""
+_GROWING = 1.2
+"""A largest deviation above this multiple of that of the third before is growing: a steady drift has 1.5."""
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class RepeatedRun:
     meets: bool
     """With the losses: do an AGV that begins where the run did and one on the reference come together?"""
     stays: bool
-    """With the losses: is the largest deviation no larger from one repetition to the next?"""
+    """With the losses: is the largest deviation no larger in the last third of the time than in the one before?"""
     largest_deviation: float
-    """Largest distance from the reference in the last repetition [m]; inf if the loop diverges."""
+    """Largest distance from the reference in the last third [m]; inf if the loop diverges."""
     largest_in_run: float
     """Largest distance from the reference in the second half of the first repetition, which is the run [m]."""
 
@@ -95,7 +95,7 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
     without = _without_losses(run.scenario, reference, begun, count * steps)
     one, two = (_under_losses(run, reference, start, count) for start in (begun, other))
     deviation = _deviation(one, reference)
-    before, last = _largest_of_last_two(deviation, steps)
+    before, last = _largest_of_thirds(deviation, steps)
     return RepeatedRun(
         seconds=count * steps * run.ts,
         settles=_settles(without, reference, run.scenario, loop),
@@ -123,7 +123,7 @@ def _settles_without_losses(scenario: Scenario) -> bool:
     starts = _starts(scenario, np.array(scenario.plant.initial_pose), lap[0])
     one, two = (_without_losses(scenario, reference, start, _LAPS * len(lap)) for start in starts)
     moves = bool(lap[:, 3:].any())
-    return _does_not_grow(*_largest_of_last_two(_deviation(one, reference), len(lap))) and (
+    return _does_not_grow(*_largest_of_thirds(_deviation(one, reference), len(lap))) and (
         not moves or _meets(one, two, np.arange(3))
     )
 
@@ -193,9 +193,10 @@ def _direct(scenario: Scenario, reference: Floats, inputs: RunInputs) -> Floats:
     return rows[:, :3]
 
 
-def _largest_of_last_two(deviation: Floats, steps: int) -> tuple[float, float]:
-    """The largest deviation of the last repetition but one, and of the last."""
-    return float(deviation[-2 * steps : -steps].max()), float(deviation[-steps:].max())
+def _largest_of_thirds(deviation: Floats, steps: int) -> tuple[float, float]:
+    """The largest deviation of the second and of the last third of all repetitions, in whole ones."""
+    third = len(deviation) // steps // 3 * steps
+    return float(deviation[-2 * third : -third].max()), float(deviation[-third:].max())
 
 
 def _does_not_grow(before: float, last: float) -> bool:

@@ -26,6 +26,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from agv_analysis.stability.driven_commands import DrivenCommands
 from agv_analysis.stability.link_confidence import LinkConfidence
 from agv_analysis.stability.repeated_run import RepeatedRun
 
@@ -96,6 +97,8 @@ class Evidence:
     """Why the loop does not settle even without losses."""
     missing: int = 0
     """Messages that are missing from the recording although no channel lost them."""
+    driven: DrivenCommands | None = None
+    """The recorded commands against the control law; None where nothing was judged."""
     contradictions: tuple[str, ...] = ()
     """How the recording contradicts what is known of the loop, a sentence each."""
     repeated: RepeatedRun | None = None
@@ -116,7 +119,7 @@ def decide(evidence: Evidence) -> Verdict:
         return Verdict(UNKNOWN, "recording", f"unknown: {reason}", reason)
     word = _by_criteria(evidence)
     against = against_stability(evidence)
-    if word.word in (*GREEN, UNDECIDED) and against:
+    if word.word in (*GREEN, UNDECIDED, UNKNOWN) and against:
         return _not_stable(evidence, SIMULATION, against)
     return word
 

@@ -1,0 +1,164 @@
+"""The word on loops and recordings that were once called stable: they drift, change, or were hardly seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agv_analysis.run import ParameterChange, Run
+from agv_analysis.scenario import Scenario, load_scenario
+from agv_analysis.simulation import simulate
+from agv_analysis.stability.analysis import Analysis, analyse
+from agv_analysis.stability.evidence import evidence_of_scenario
+from agv_analysis.stability.verdict import GREEN, decide
+from agv_analysis.sweep.collect import collect
+from agv_analysis.sweep.execute import on_this_machine
+from agv_analysis.sweep.plan import Sweep, axis_of
+
+PAPER, LINE = str(Path(__file__).parents[3] / "config/paper.yaml"), "error_detector.track=line"
+
+BEHIND = (LINE, "controller.v_max=0.8")
+"""Slower than the reference: it falls behind by 0.2 m/s for ever."""
+
+SWINGS = (
+    LINE, "plant.speed_scale=1.3", "controller.kx=1.0", "controller.ky=64.0", "controller.ktheta=16.0",
+    "error_detector.speed=2.0",
+)  # fmt: skip
+
+HEAVY = (
+    "controller.v_max=2.0", "plant.a_max=1.5", "plant.j_max=10.0", "plant.lag=0.05", "plant.noise_xy=0.005",
+    "plant.noise_theta=0.005",
+)  # fmt: skip
+"""The heavy AGV of docs/plant.md: its limit on the jerk makes it swing by 1.2 m without any loss."""
+
+BERNOULLI = (LINE, "relay.uplink.model=bernoulli")
+UNSTABLE_GILBERT = (LINE, "relay.uplink.model=gilbert_elliott", "relay.uplink.p=0.001", "relay.uplink.r=0.01")
+"""Mean age 9.09 steps, where K_x = 25 allows 7.5."""
+
+
+def scenario_of(*settings: str) -> Scenario:
+    return load_scenario(PAPER, settings)
+
+
+def of(*settings: str) -> Analysis:
+    return analyse(simulate(scenario_of(*settings)))
+
+
+@pytest.mark.parametrize("settings", [BEHIND, SWINGS, HEAVY], ids=["falls behind", "swings", "heavy"])
+def test_a_loop_that_does_not_settle_without_losses_is_not_green_anywhere(settings: tuple[str, ...]) -> None:
+    assert of(*settings).verdict.word not in GREEN
+    assert decide(evidence_of_scenario(scenario_of(*settings))).word not in GREEN
+    sweep = Sweep(scenario_of(*settings, "plant.duration=20.0"), (axis_of("plant.noise_xy", [0.0]),), 2)
+    rows, _ = collect(sweep, None, lambda parts: on_this_machine(sweep, parts), lambda done: None)
+    assert [row["unstable"] for row in rows] == [2]
+
+
+def test_the_reason_says_how_an_agv_that_is_too_slow_moves() -> None:
+    found = of(*BEHIND)
+    assert found.verdict.word == "infeasible"
+    assert "falls behind its reference by 0.2 m/s" in found.verdict.reason
+
+
+def test_a_limit_on_the_turn_rate_under_long_bursts() -> None:
+    found = of("plant.w_max=0.1", "error_detector.policy=predict", "relay.uplink.model=burst", "relay.uplink.n=200")
+    assert found.convergence.position.peak > 1000.0
+    assert found.verdict.word == "unstable"
+
+
+def test_a_link_that_changes_is_judged_by_its_worst_part() -> None:
+    found = of(*BERNOULLI, "relay.uplink.schedule=0: p=0.05; 70: p=0.97")
+    assert found.verdict.word == "unstable"
+    assert "the link changed" in found.verdict.reason
+    figures = found.to_json()
+    (change,) = figures["stationarity"]["change_points"]
+    assert change == pytest.approx(14_000, abs=20)
+    assert figures["confidence"] < 0.05
+
+
+def test_too_little_seen_of_an_unstable_link_is_seldom_green() -> None:
+    words = [of(*UNSTABLE_GILBERT, f"relay.seed={seed}", "plant.duration=10.0").verdict.word for seed in range(12)]
+    assert sum(word in GREEN for word in words) <= 1
+    assert "undecided" in words
+
+
+def test_a_link_that_was_hardly_seen_says_how_much_longer_to_record() -> None:
+    found = of(*UNSTABLE_GILBERT, "relay.uplink.p=0.0005", "relay.uplink.r=0.1", "plant.duration=5.0")
+    assert found.verdict.word == "undecided"
+    assert found.to_json()["record_seconds_more"] > 1.0
+
+
+def test_outages_by_the_clock_are_no_gilbert_channel() -> None:
+    """0.2 s of every 1 s: E[L^2]/E[L] = (160 + 41^2) / 201 = 9.2 steps, below 2/a = 16."""
+    found = of(LINE, "relay.uplink.schedule=0: outage=0.2 every 1")
+    assert found.verdict.word in GREEN
+    assert found.to_json()["stationarity"] is not None
+
+
+def test_a_run_that_ends_in_an_outage_is_not_judged_as_if_it_never_ended() -> None:
+    run = simulate(scenario_of(*BERNOULLI, "relay.uplink.p=0.0", "plant.duration=10.0"))
+    lost = np.zeros(len(run), dtype=np.bool_)
+    lost[-30:] = True
+    found = analyse(dataclasses.replace(run, lost=lost, n_ul=np.where(lost, np.arange(len(run)) - len(run) + 31, 0)))
+    assert found.verdict.word == "undecided"
+
+
+def test_intervals_that_no_gilbert_channel_makes(tmp_path: Path) -> None:
+    """An outage follows 25 % of receptions, 5 % of these last 60 slots, the others 1: E[(1 - aL)^2] = 1.256."""
+    rng = np.random.default_rng(3)
+    slots: list[int] = []
+    while len(slots) < 20_000:
+        outage = (60 if rng.random() < 0.05 else 1) if rng.random() < 0.25 else 0
+        slots += [0, *[1] * outage]
+    trace = tmp_path / "trace.csv"
+    trace.write_text("lost\n" + "\n".join(map(str, slots)) + "\n")
+    assert of(LINE, "relay.uplink.model=trace", f"relay.uplink.trace_file={trace}").verdict.word not in GREEN
+
+
+# -- what was driven --------------------------------------------------------------------------------------------------
+
+
+def with_kx(run: Run, kx: float) -> Run:
+    """A run whose K_x is said to be another than that which was driven."""
+    controller = dataclasses.replace(run.scenario.controller, kx=kx)
+    return dataclasses.replace(run, scenario=dataclasses.replace(run.scenario, controller=controller))
+
+
+def test_commands_of_other_gains_are_not_judged_by_the_parameters() -> None:
+    found = analyse(with_kx(simulate(scenario_of("controller.kx=50.0", "plant.duration=20.0")), 25.0))
+    assert found.verdict.word == "unknown"
+    assert "K_x = 50.0, not 25.0" in found.verdict.reason
+
+
+def test_each_part_between_changes_of_a_parameter_is_judged_and_the_worst_decides() -> None:
+    """K_x = 500 has a = 2.5 > 2: it diverges without any loss."""
+    begun = simulate(scenario_of(LINE, "plant.duration=20.0"))
+    x, y, theta = begun.pose[-1]
+    start = ["plant.duration=0.1", LINE, "controller.kx=500.0"]
+    start += [f"plant.initial_pose=[{x}, {y + 0.01}, {theta}]"]
+    ended = simulate(scenario_of(*start))
+    later = dataclasses.replace(ended, reference=begun.reference[-1] + 0.0 * ended.reference)
+    names = ("pose", "reference", "error", "command", "n_ul", "lost", "downlink_lost", "n_dl")
+    rows: dict[str, Any] = {name: np.concatenate((getattr(begun, name), getattr(later, name))) for name in names}
+    change = ParameterChange(len(begun), "controller", "kx", 25.0, 500.0)
+    k = np.arange(len(begun) + len(ended))
+    run = dataclasses.replace(begun, k=k, **rows, uplink=None, downlink=None, parameter_changes=(change,))
+    found = analyse(run)
+    assert found.verdict.word not in GREEN
+    assert "parameters were changed, and from 20 s" in found.verdict.reason
+
+
+def test_an_agv_that_strays_further_than_its_simulation() -> None:
+    run = simulate(scenario_of(LINE, "plant.duration=20.0"))
+    aside = np.where(run.time > 10.0, 0.3, 0.0)
+    found = analyse(dataclasses.replace(run, pose=run.pose + aside[:, None] * [1.0, 0.0, 0.0]))
+    assert found.verdict.word == "unknown"
+    assert "in the simulation under the same losses" in found.verdict.reason
+
+
+def test_messages_that_are_missing_prove_nothing() -> None:
+    run = simulate(scenario_of(LINE, "plant.duration=20.0"))
+    assert analyse(dataclasses.replace(run, unexplained={"/edge/pose": 4})).verdict.word == "unknown"
