@@ -13,7 +13,9 @@ Measurement noise and slip are left out: what a loop forgets does not depend on 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,10 +53,10 @@ _MET = 1e-6
 _APART = 1e-3
 """An AGV that begins on the reference is held against one that begins this far [m, m, rad] away."""
 
-_SHRINKING = 0.9
-"""A distance that is below this share of what it was half the time before goes on shrinking."""
+_SHRINKING = 0.7
+"""A distance that is below this share of what it was a quarter of the time before goes on shrinking."""
 
-_GROWING = 1.2
+_GROWING = 1.4
 """A largest deviation above this multiple of that of the third before is growing: a steady drift has 1.5."""
 
 
@@ -248,15 +250,16 @@ def _deviation(poses: Floats, reference: Floats) -> Floats:
     return np.where(np.isfinite(apart), apart, math.inf)
 
 
-def _halfway_and_end(steps: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows halfway and at the end: a tenth of all before each of these."""
-    return np.arange(steps * 4 // 10, steps // 2), np.arange(steps * 9 // 10, steps)
+def _moments(steps: int) -> list[NDArray[np.int64]]:
+    """Rows of a twentieth of all: after a quarter, half, three quarters, and at the end."""
+    return [np.arange(steps * (part - 1) // 20, steps * part // 20) for part in (5, 10, 15, 20)]
 
 
-def _is_small_or_shrinks(halfway: Floats, end: Floats, small: float) -> bool:
-    """Is a distance below a size in the end, or does it go on shrinking? Shapes (N,)."""
-    before, after = float(np.median(halfway)), float(np.median(end))
-    return math.isfinite(after) and (after <= small or after < _SHRINKING * before)
+def _is_small_or_shrinks(distances: Sequence[Floats], small: float) -> bool:
+    """Is a distance small in the end, or does it shrink from each of the `_moments` to the next?"""
+    found = [float(np.median(distance)) for distance in distances]
+    shrinks = all(later < _SHRINKING * before for before, later in itertools.pairwise(found))
+    return math.isfinite(found[-1]) and (found[-1] <= small or shrinks)
 
 
 def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearLoop) -> bool:
@@ -271,19 +274,17 @@ def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearL
         error[:, 2] = wrapped(error[:, 2])
         return np.asarray(np.abs(error[:, columns]).max(axis=1))
 
-    halfway, end = (distance(rows) for rows in _halfway_and_end(len(poses)))
-    return _is_small_or_shrinks(halfway, end, _SETTLED)
+    return _is_small_or_shrinks([distance(rows) for rows in _moments(len(poses))], _SETTLED)
 
 
 def _meets(one: Floats, other: Floats, columns: NDArray[np.int64]) -> bool:
-    with np.errstate(over="ignore", invalid="ignore"):
-        apart = np.abs(one - other)
-    if not np.isfinite(apart).all():
+    if not (np.isfinite(one).all() and np.isfinite(other).all()):
         return False
-    if len(columns) < apart.shape[1]:
+    if len(columns) < one.shape[1]:
         return True
-    halfway, end = (apart[rows].max(axis=1) for rows in _halfway_and_end(len(apart)))
-    return _is_small_or_shrinks(halfway, end, _MET)
+    apart = one - other
+    apart[:, 2] = wrapped(apart[:, 2])  # one of the two may have turned around once more
+    return _is_small_or_shrinks([np.abs(apart[rows]).max(axis=1) for rows in _moments(len(apart))], _MET)
 
 
 def _moved_by_commands(loop: LinearLoop) -> NDArray[np.int64]:
