@@ -65,6 +65,7 @@ def command(
     from agv_analysis.stability.empirical import simulated_twins, with_an_end
     from agv_analysis.stability.evidence import evidence_of_scenario
     from agv_analysis.stability.margins import margins
+    from agv_analysis.stability.repeated_run import settles_without_losses
     from agv_analysis.stability.twins_border import twins_border
     from agv_analysis.stability.verdict import decide
 
@@ -88,7 +89,10 @@ def command(
     table.add_row("Verdict", f"[bold {colour_of(verdict)}]{verdict.word}[/] (by {verdict.criterion})")
     table.add_row("Because", escape(verdict.reason))
     table.add_row("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
-    for name, value in (*found.rows(), ("Twins of this scenario, simulated", _told(twins, seeds))):
+    said_of_twins = _told(twins, seeds)
+    if twins.contracting and not settles_without_losses(scenario):
+        said_of_twins += "; they come together, but the loop does not settle even without losses"
+    for name, value in (*found.rows(), ("Twins of this scenario, simulated", said_of_twins)):
         table.add_row(name, escape(value))
     console.print(table)
     best, why_no_gain = _best_gains(scenario)

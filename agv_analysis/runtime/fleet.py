@@ -22,6 +22,7 @@ from agv_analysis.simulation import simulate
 from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.empirical import distances
+from agv_analysis.stability.repeated_run import settles_without_losses
 from agv_plant.channels.registry import SHARED
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
@@ -111,7 +112,7 @@ class Vehicle:
     contraction: float | None = None
     """Distance of twins under its loss sequence at the end, as a multiple of that at the beginning; see `twins`."""
     unstable: bool | None = None
-    """Did its twins not come closer to each other, or did it diverge?"""
+    """Did its twins not come closer to each other, did it diverge, or does its loop not settle even without losses?"""
 
 
 def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
@@ -133,8 +134,15 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
         verdict=figures["verdict"],
         verdict_criterion=figures["verdict_criterion"],
         contraction=contraction if contraction is not None and math.isfinite(contraction) else None,
-        unstable=None if contraction is None else not contraction < 1.0,
+        unstable=_is_unstable(found.run.scenario, contraction),
     )
+
+
+def _is_unstable(scenario: Scenario, contraction: float | None) -> bool | None:
+    """As a sweep counts it: twins do not come together, or the loop does not settle even without losses."""
+    if not settles_without_losses(scenario):
+        return True
+    return None if contraction is None else not contraction < 1.0
 
 
 def twins(run: Run) -> float | None:
