@@ -18,7 +18,10 @@ from agv_plant.channels.registry import MODELS
 from agv_ros.parameters import Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.stamps import Grid
 
-DEFAULTS = Scenario(**{node: schema() for node, schema in SCHEMAS.items()})
+
+def defaults() -> Scenario:
+    """A scenario of which a file says nothing."""
+    return Scenario(**{node: schema() for node, schema in SCHEMAS.items()})
 
 
 def refusal(text: str, *sets: str) -> str:
@@ -30,7 +33,7 @@ def refusal(text: str, *sets: str) -> str:
 
 def test_what_a_file_does_not_say_keeps_its_default() -> None:
     found = parse_scenario("controller: {ros__parameters: {kx: 5.0}}", "f.yaml")
-    assert found == dataclasses.replace(DEFAULTS, controller=dataclasses.replace(DEFAULTS.controller, kx=5.0))
+    assert found == dataclasses.replace(defaults(), controller=dataclasses.replace(defaults().controller, kx=5.0))
 
 
 def test_the_grid_is_that_of_every_node() -> None:
@@ -47,7 +50,7 @@ local_costmap: {local_costmap: {ros__parameters: {width: 3}}}
 controller: {ros__parameters: {kx: 5.0}}
 """
     assert parse_scenario(text, "f.yaml").controller.kx == 5.0
-    assert parse_scenario(text, "f.yaml").relay == DEFAULTS.relay
+    assert parse_scenario(text, "f.yaml").relay == defaults().relay
 
 
 @pytest.mark.parametrize(
@@ -175,9 +178,9 @@ def test_a_scenario_written_out_is_the_same_to_ros(
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     path = tmp_path / "params.yaml"
     edge = dataclasses.replace(
-        DEFAULTS.error_detector, track_file=track_file, lap_time=1e16, track_start=(1e-7, -0.0, 2.5)
+        defaults().error_detector, track_file=track_file, lap_time=1e16, track_start=(1e-7, -0.0, 2.5)
     )
-    path.write_text(dataclasses.replace(DEFAULTS, error_detector=edge).to_yaml(), encoding="utf-8")
+    path.write_text(dataclasses.replace(defaults(), error_detector=edge).to_yaml(), encoding="utf-8")
     context = rclpy.Context()
     rclpy.init(context=context, args=["--ros-args", "--params-file", str(path)], domain_id=88)
     try:
