@@ -32,6 +32,9 @@ _TIMES_AS_FAR = 2.0
 _TOLERANCE = 0.05
 """It may be this much [m] larger in any case."""
 
+_PLACES = 2000
+"""Places of the lap, at least, at which it is asked how much longer outages may become."""
+
 _NOISE = 6.0
 """Standard deviations of the measurement noise by which it may be larger."""
 
@@ -179,7 +182,7 @@ def _burst_left(fit: ChannelFit, link: LinkConfidence, loop: LinearLoop) -> floa
     is_described = fit.model == "gilbert_elliott" and fit.goodness.fits and len(link.segments) == 1
     if not is_described or link.growth >= 0.0 or fit.chain.loss_rate >= 1.0:
         return None
-    critical = mean_square.critical_burst(loop, fit.chain.loss_rate)
+    critical = mean_square.critical_burst(loop.thinned(_PLACES), fit.chain.loss_rate)
     return critical / fit.mean_burst if np.isfinite(critical) else None
 
 

@@ -194,6 +194,14 @@ class LinearLoop:
         }
         return dataclasses.replace(self, v_r=self.v_r[steps], w_r=self.w_r[steps], **rows)
 
+    def thinned(self, places: int) -> LinearLoop:
+        """The loop at every so many steps of its lap, at `places` of them at least.
+
+        Speeds change little from one step to the next, so growth per step is nearly the same, in a share of the time.
+        """
+        stride = max(1, self.steps // places)
+        return self if self.is_constant or stride == 1 else self.at(np.arange(0, self.steps, stride))
+
     def frozen(self, step: int) -> LinearLoop:
         """The loop that stays as it is at one step of the lap."""
         return self.at(np.array([step]))

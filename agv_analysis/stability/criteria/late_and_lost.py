@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import numpy as np
-
 from agv_analysis.link.age_chain import AgeChain, age_chain_of, fitted_ages
 from agv_analysis.stability import delayed_mean_square
 from agv_analysis.stability.criteria.criterion import (
@@ -46,14 +44,8 @@ def growths_of_halves(facts: RunFacts) -> tuple[float | None, float | None]:
 
 
 def _growth(facts: RunFacts, rows: slice) -> float | None:
-    ages, loop = fitted_ages(facts.run.n_ul[rows]), _thinned(facts.loop)
+    ages, loop = fitted_ages(facts.run.n_ul[rows]), facts.loop.thinned(_PLACES)
     return None if _why_not(loop, ages) else delayed_mean_square.lap_growth(loop, ages) / loop.steps
-
-
-def _thinned(loop: LinearLoop) -> LinearLoop:
-    """The loop at so many places of its lap that the growth per step is the same, but not at all of them."""
-    stride = max(1, loop.steps // _PLACES)
-    return loop if loop.is_constant or stride == 1 else loop.at(np.arange(0, loop.steps, stride))
 
 
 def _why_not(loop: LinearLoop, ages: AgeChain) -> str:
