@@ -110,8 +110,8 @@ def is_sound(loops: list[Loop], seed: int, is_lossy: bool) -> np.ndarray:
         half, end = np.median(apart[steps // 2 - 1500 : steps // 2], axis=0), np.median(apart[-1500:], axis=0)
         meets = np.isfinite(end) & ((end < 1e-4) | (end < 0.5 * half))
         deviation = np.hypot(errors[:, 0], errors[:, 1])
-        before, last = deviation[steps // 3 : 2 * steps // 3].max(axis=0), deviation[2 * steps // 3 :].max(axis=0)
-        stays = np.isfinite(last) & ((last <= 1.5 * before) | (last <= before + 0.02))
+        before, last = (np.median(deviation[steps * i // 3 : steps * (i + 1) // 3], axis=0) for i in (1, 2))
+        stays = np.isfinite(deviation).all(axis=0) & ((last <= 1.5 * before) | (last <= before + 0.02))
         if is_lossy:
             return np.asarray(meets & stays)
         change = np.abs(errors[-lap:] - errors[-2 * lap : -lap]).max(axis=(0, 1))
