@@ -15,6 +15,7 @@ from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability import joint_spectral_radius, mean_square, mean_square_two_links
+from agv_analysis.stability.confidence.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import longest_for
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
@@ -22,7 +23,6 @@ from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
 from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
 from agv_analysis.stability.empirical import Twins, with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.repeated_run import RepeatedRun, repeated_run
 from agv_analysis.stability.verdict import Evidence, Verdict, decide, weakest
 

@@ -26,8 +26,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from agv_analysis.stability.confidence.link_confidence import LinkConfidence
 from agv_analysis.stability.driven_commands import DrivenCommands
-from agv_analysis.stability.link_confidence import LinkConfidence
 from agv_analysis.stability.repeated_run import RepeatedRun
 
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"

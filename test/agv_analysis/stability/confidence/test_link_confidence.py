@@ -17,16 +17,16 @@ from agv_analysis.link.markov_channel import Chain, gilbert_elliott
 from agv_analysis.link.transitions import count_transitions
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability import mean_square
-from agv_analysis.stability.gilbert_growth import gilbert_growths
-from agv_analysis.stability.growth_posterior import SURE, GrowthPosterior
-from agv_analysis.stability.interval_growth import interval_growth
+from agv_analysis.stability.confidence.gilbert_growth import gilbert_growths
+from agv_analysis.stability.confidence.growth_posterior import SURE, GrowthPosterior
+from agv_analysis.stability.confidence.interval_growth import interval_growth
+from agv_analysis.stability.confidence.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
-from agv_analysis.stability.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.scenario_loop import loop_on_lap
 from agv_cloud.parameters import ControllerParameters
 from test.agv_analysis.link.recorded_outcomes import Outcomes, gap_and_outage, gilbert, series
 
-REPOSITORY = Path(__file__).parents[3]
+REPOSITORY = Path(__file__).parents[4]
 TS = 0.005
 
 

@@ -24,7 +24,7 @@ from agv_analysis.link.markov_channel import gilbert_elliott
 from agv_analysis.link.transitions import Transitions, interval_of
 from agv_analysis.run import Floats
 from agv_analysis.stability import mean_square
-from agv_analysis.stability.gilbert_growth import gilbert_growths
+from agv_analysis.stability.confidence.gilbert_growth import gilbert_growths
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 
 SURE = 0.95

@@ -16,9 +16,9 @@ from agv_analysis.link.reception_intervals import Intervals, Outcomes, Steps, re
 from agv_analysis.link.transitions import count_transitions
 from agv_analysis.run import Floats
 from agv_analysis.stability import mean_square
+from agv_analysis.stability.confidence.growth_posterior import SURE, GrowthPosterior
+from agv_analysis.stability.confidence.interval_growth import IntervalGrowth, grows_for_a_while, interval_growth
 from agv_analysis.stability.floquet import drop_sequence
-from agv_analysis.stability.growth_posterior import SURE, GrowthPosterior
-from agv_analysis.stability.interval_growth import IntervalGrowth, grows_for_a_while, interval_growth
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 
 GILBERT, RENEWAL, BLOCKS, PERIODIC, PREDICTED = (

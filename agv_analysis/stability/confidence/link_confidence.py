@@ -23,9 +23,9 @@ from agv_analysis.link.goodness_of_fit import Goodness
 from agv_analysis.link.periodic_outages import period_of
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.transitions import count_transitions
-from agv_analysis.stability.growth_posterior import moved
+from agv_analysis.stability.confidence.growth_posterior import moved
+from agv_analysis.stability.confidence.segment_confidence import SegmentConfidence, segment_confidence
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.segment_confidence import SegmentConfidence, segment_confidence
 
 
 @dataclass(frozen=True)
