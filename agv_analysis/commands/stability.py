@@ -81,7 +81,8 @@ def command(
         status.update("simulating twins under more and more losses ...")
         border = twins_border(run, progress=lambda done: status.update(f"simulating twins: {done} loss probabilities"))
         found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
-        verdict = decide(evidence_of_scenario(scenario, twins))
+        evidence = evidence_of_scenario(scenario, twins)
+        verdict = decide(evidence)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
@@ -111,8 +112,8 @@ def command(
     if found.left_out:
         console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
-        said = {"verdict": verdict.word, "verdict_criterion": verdict.criterion, "verdict_reason": verdict.reason}
-        write_json(json_file, {**said, **found.to_json(), **_gains_to_json(best, why_no_gain)})
+        word = {**verdict.to_json(), "confidence": evidence.confidence}
+        write_json(json_file, {**word, **found.to_json(), **_gains_to_json(best, why_no_gain)})
 
 
 def _told(twins: Twins, seeds: range) -> str:

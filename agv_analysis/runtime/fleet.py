@@ -109,6 +109,7 @@ class Vehicle:
     """[m]"""
     verdict: str | None = None
     verdict_criterion: str | None = None
+    verdict_reason: str | None = None
     contraction: float | None = None
     """Distance of twins under its loss sequence at the end, as a multiple of that at the beginning; see `twins`."""
     unstable: bool | None = None
@@ -133,6 +134,7 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
         final_error=figures["final_error"],
         verdict=figures["verdict"],
         verdict_criterion=figures["verdict_criterion"],
+        verdict_reason=figures["verdict_reason"],
         contraction=contraction if contraction is not None and math.isfinite(contraction) else None,
         unstable=_is_unstable(found.run.scenario, contraction),
     )

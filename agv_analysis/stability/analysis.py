@@ -178,12 +178,6 @@ class Analysis(Observations):
             )
         return found
 
-    def _of_known_link(self) -> dict[str, Any]:
-        """Where the link is known, or was not judged by its outcomes."""
-        evidence = self.evidence
-        is_judged = evidence.growth is not None or evidence.late_by is not None
-        return {"confidence": evidence.probability_stable if is_judged else None}
-
     def to_json(self) -> dict[str, Any]:
         """The figures by name, as `Observations.to_json`."""
         values = {name: value for found in self.judgements.values() for name, value in found.values.items()}
@@ -191,11 +185,10 @@ class Analysis(Observations):
         return {
             **super().to_json(),
             **values,
-            **(self._of_known_link() if link is None else link.to_json()),
+            "confidence": self.evidence.confidence,
+            **({} if link is None else link.to_json()),
             "driven": None if self.evidence.driven is None else self.evidence.driven.to_json(),
-            "verdict": self.verdict.word,
-            "verdict_criterion": self.verdict.criterion,
-            "verdict_reason": self.verdict.reason,
+            **self.verdict.to_json(),
             "margin": self.verdict.margin,
             "feasible": not self.infeasible,
             "infeasible_reason": self.infeasible or None,

@@ -62,6 +62,10 @@ class Verdict:
     margin: str
     reason: str = ""
 
+    def to_json(self) -> dict[str, str]:
+        """The word, what decided it, and why, by name."""
+        return {"verdict": self.word, "verdict_criterion": self.criterion, "verdict_reason": self.reason}
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -105,6 +109,11 @@ class Evidence:
     """The nonlinear loop under these losses again and again; None where it could not be driven."""
     twins: tuple[int, int] | None = None
     """How many simulated runs of how many contract the distance of twins."""
+
+    @property
+    def confidence(self) -> float | None:
+        """Probability of a stable loop, given the losses that were seen; None where it was not asked."""
+        return self.probability_stable if self.growth is not None or self.late_by is not None else None
 
 
 def decide(evidence: Evidence) -> Verdict:
