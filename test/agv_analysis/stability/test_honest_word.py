@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agv_analysis.run import ParameterChange, Run
+from agv_analysis.run import ParameterChange, Run, Timing
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.analysis import Analysis, analyse
@@ -162,3 +162,24 @@ def test_an_agv_that_strays_further_than_its_simulation() -> None:
 def test_messages_that_are_missing_prove_nothing() -> None:
     run = simulate(scenario_of(LINE, "plant.duration=20.0"))
     assert analyse(dataclasses.replace(run, unexplained={"/edge/pose": 4})).verdict.word == "unknown"
+
+
+# -- when messages came -----------------------------------------------------------------------------------------------
+
+
+def test_poses_that_wait_and_arrive_together_are_not_judged_as_if_they_had_come_at_once() -> None:
+    """Nothing is lost, but for 5 of every 6 s poses wait, as over a reliable connection that stalls."""
+    run = simulate(scenario_of(LINE, "plant.duration=30.0"))
+    age = np.maximum(run.k % 1200 - 200, 0)
+    found = analyse(dataclasses.replace(run, timing=Timing(is_late=True, command_age=age)))
+    assert found.n == 999
+    assert found.verdict.word not in GREEN
+
+
+def test_missed_deadlines_without_a_record_of_when_messages_came() -> None:
+    run = simulate(scenario_of(LINE, "plant.duration=20.0"))
+    ages = np.zeros(len(run), dtype=np.int64)
+    timing = Timing(False, ages, deadlines=1200, missed_deadlines=153, unknown="log times are the stamps")
+    found = analyse(dataclasses.replace(run, timing=timing))
+    assert found.verdict.word == "unknown"
+    assert "153 deadlines were missed" in found.verdict.reason
