@@ -24,7 +24,7 @@ from agv_analysis.stability.driven_commands import DrivenCommands, driven_comman
 from agv_analysis.stability.empirical import Twins, with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.repeated_run import RepeatedRun, repeated_run
-from agv_analysis.stability.verdict import Evidence, Verdict, decide, weakest
+from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, Evidence, Verdict, decide, weakest
 
 _TIMES_AS_FAR = 2.0
 """A recorded deviation may be this many times the simulated one, for what the model of the plant does not know."""
@@ -79,15 +79,22 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
         return _of_late_messages(common, facts, judgements)
     if run.downlink_lost.any():
         return _of_both_links(common, facts, judgements)
-    n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
     if _loses_nothing(run):
-        growth = float(judgements["mean_square"].detail[0])
-        return replace(common, n_bursts=n_bursts, growth=growth)
+        return _with_margin(_with_growth(common, float(judgements["mean_square"].detail[0])), facts)
     link = link_confidence(facts.loop, run.k, run.lost, run.ts)
-    return replace(
-        common, n_bursts=n_bursts, growth=link.growth, burst_left=_burst_left(facts.fit, link, facts.loop), link=link,
-        probability_stable=link.probability_stable,
-    )  # fmt: skip
+    sure = replace(common, growth=link.growth, link=link, probability_stable=link.probability_stable)
+    return _with_margin(sure, facts)
+
+
+def _with_margin(evidence: Evidence, facts: RunFacts) -> Evidence:
+    """With what only a green word asks for, and what takes longest: which outages any sequence may have, and longer."""
+    if decide(evidence).word not in GREEN:
+        return evidence
+    n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
+    found = replace(evidence, n_bursts=n_bursts)
+    if evidence.link is None or decide(found).word != MEAN_SQUARE:
+        return found
+    return replace(found, burst_left=_burst_left(facts.fit, evidence.link, facts.loop))
 
 
 def _loses_nothing(run: Run) -> bool:
@@ -110,10 +117,8 @@ def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evid
     if not facts.is_feasible or facts.is_late or uplink is None or downlink is None or downlink.loss_rate > 0.0:
         return found
     growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
-    return replace(
-        found, growth=growth, probability_stable=1.0 if growth < 0.0 else 0.0, link=None,
-        is_unlimited=_is_random(uplink), burst_left=None,
-    )  # fmt: skip
+    known = replace(found, link=None, burst_left=None, is_unlimited=_is_random(uplink))
+    return _with_margin(_with_growth(known, growth), facts)
 
 
 def _is_random(chain: Chain) -> bool:
@@ -139,7 +144,7 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
     return replace(common, not_covered=why)
 
 
-def _with_growth(common: Evidence, growth: float, growth_of: str, unsure: str) -> Evidence:
+def _with_growth(common: Evidence, growth: float, growth_of: str = "mean_square", unsure: str = "") -> Evidence:
     """With a growth that is sure, unless something speaks against it."""
     probability = 0.5 if unsure else 1.0 if growth < 0.0 else 0.0
     return replace(common, growth=growth, growth_of=growth_of, probability_stable=probability, seen=unsure)

@@ -149,15 +149,15 @@ def _by_criteria(evidence: Evidence) -> Verdict:
     if evidence.probability_stable < SURE:
         return _undecided(evidence)
     is_survived = evidence.n_bursts is None or evidence.n <= evidence.n_bursts
+    if evidence.growth >= 0.0:
+        return _not_stable(evidence, evidence.growth_of, _grows(evidence))
     if evidence.growth_of == "mean_square" and is_survived and not evidence.is_unlimited:
         left = "any number of" if evidence.n_bursts is None else str(evidence.n_bursts - evidence.n)
         plural = "s" if left != "1" else ""
         reason = f"any sequence of outages of up to {evidence.n} slots is survived"
         sure = f"; {_of_link(evidence)}" if evidence.link is not None else ""
         return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{plural}", reason + sure)
-    if evidence.growth < 0.0:
-        return _mean_square(evidence)
-    return _not_stable(evidence, evidence.growth_of, _grows(evidence))
+    return _mean_square(evidence)
 
 
 def _mean_square(evidence: Evidence) -> Verdict:
@@ -211,11 +211,9 @@ def _grows(evidence: Evidence) -> str:
         return "messages are late, and under ages like these the mean square of the error grows"
     if evidence.link is not None:
         return evidence.link.reason
-    grows = "under this link the mean square of the error grows"
-    is_survived = evidence.n_bursts is None or evidence.n <= evidence.n_bursts
-    if evidence.n_bursts is not None and evidence.n_bursts < 0:
+    if evidence.n == 0 and not evidence.is_unlimited:
         return "a small error grows even without losses"
-    return grows if is_survived or evidence.is_unlimited else f"{_beyond(evidence)}, and {grows}"
+    return "under this link the mean square of the error grows"
 
 
 def _beyond(evidence: Evidence) -> str:
