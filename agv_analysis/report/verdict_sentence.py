@@ -37,7 +37,7 @@ def sentence(analysis: Observations) -> str:
         return f"Whether the loop is stable cannot be said: {verdict.reason}."
     if verdict.word == INFEASIBLE:
         return f"The AGV does not keep to its track even on a perfect link: {analysis.infeasible}."
-    if verdict.criterion == SIMULATION or analysis.n == 0:
+    if verdict.criterion == SIMULATION or (analysis.n == 0 and not analysis.run.downlink_lost.any()):
         return f"The AGV does not keep to its track: {verdict.reason}."
     if verdict.word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
