@@ -51,8 +51,9 @@ def command(
 ) -> None:
     """Simulate the params file PARAMS at every point of a grid, under many seeds: how likely is the loop unstable?
 
-    A run is unstable if a twin that begins a micrometre away and meets the same losses does not come closer by its end.
-    Every point meets the same seeds, so points with the same channel meet the same outages.
+    A run is unstable if a twin that begins a micrometre away and meets the same losses does not come closer by its end,
+    or if the loop does not settle even without losses. Every point meets the same seeds, so points with the same
+    channel meet the same outages.
 
     \b
     Examples:
