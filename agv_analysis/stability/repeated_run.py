@@ -97,19 +97,28 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
     steps = len(run)
     count = min(max(3, math.ceil(SECONDS / (steps * run.ts))), max(3, _MOST_STEPS // steps))
     reference = _repeated_reference(run.scenario, run.reference, count)
-    starts = _starts(run.scenario, run.pose[0], run.reference[0])
+    starts, columns = _starts(run.scenario, run.pose[0], run.reference[0]), _moved_by_commands(loop)
     beside = (_start(run.scenario, run.pose[0, :3] + offset) for offset in _BESIDE)
-    without = [_without_losses(run.scenario, reference, start, count * steps) for start in (starts[0], *beside)]
-    under = [[_under_losses(run, reference, start, count, shift) for start in starts] for shift in _shifts(run)]
-    thirds = [_largest_of_thirds(_deviation(poses, reference), steps) for poses, *_ in under]
-    columns, in_run = _moved_by_commands(loop), _deviation(under[0][0][:steps], reference)
+    settles = all(
+        _settles(_without_losses(run.scenario, reference, start, count * steps), reference, run.scenario, loop)
+        for start in (starts[0], *beside)
+    )
+    meets, thirds, in_run = True, [], np.zeros(0)
+    for shift in _shifts(run):
+        begun = _under_losses(run, reference, starts[0], count, shift)
+        others = (_under_losses(run, reference, start, count, shift) for start in starts[1:])
+        meets = meets and all(_meets(begun, other, columns) for other in others)
+        deviation = _deviation(begun, reference)
+        thirds.append(_largest_of_thirds(deviation, steps))
+        if shift == 0:
+            in_run = deviation[steps // 2 : steps]
     return RepeatedRun(
         seconds=count * steps * run.ts,
-        settles=all(_settles(poses, reference, run.scenario, loop) for poses in without),
-        meets=all(_meets(begun, other, columns) for begun, *others in under for other in others),
+        settles=settles,
+        meets=meets,
         stays=all(_does_not_grow(before, last) for before, last in thirds),
         largest_deviation=max(last for _, last in thirds),
-        largest_in_run=float(in_run[steps // 2 :].max()),
+        largest_in_run=float(in_run.max()),
     )
 
 
@@ -199,13 +208,13 @@ def _under_losses(run: Run, reference: Floats, start: Loop, count: int, shift: i
     traces, rows = (empty_trace(len(lost)), empty_trace(len(lost))), np.full((len(lost), 8), math.nan)
     parts = replacements_of(run.scenario)
     run_parts(history_over_links, parts, numbers(reference), inputs, up, down, *traces, rows)
-    return rows[:, :3]
+    return np.array(rows[:, :3])
 
 
 def _direct(scenario: Scenario, reference: Floats, inputs: RunInputs) -> Floats:
     rows, n_ul = np.full((len(inputs.lost), 8), math.nan), np.empty(len(inputs.lost), dtype=np.int64)
     run_parts(history, replacements_of(scenario), numbers(reference), inputs, rows, n_ul)
-    return rows[:, :3]
+    return np.array(rows[:, :3])  # not to keep the rest
 
 
 def _largest_of_thirds(deviation: Floats, steps: int) -> tuple[float, float]:
