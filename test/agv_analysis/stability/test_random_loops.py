@@ -22,7 +22,7 @@ TS, LAP = 0.02, 5000
 J01 = 2.404825557695773
 """First zero of the Bessel function J0: a figure of eight closes with it."""
 
-LOOPS, SECONDS = 24, 600.0
+LOOPS, SECONDS = 16, 600.0
 Loop = dict[str, Any]
 
 
@@ -139,10 +139,10 @@ def test_no_green_word_on_a_random_loop_that_drifts_cycles_or_grows() -> None:
     rng = np.random.default_rng(11)
     loops = [random_loop(rng) for _ in range(LOOPS)]
     sound = is_sound(loops, 12, is_lossy=False) & is_sound(loops, 13, is_lossy=True)
-    assert 4 < np.count_nonzero(sound) < LOOPS - 4
+    assert 3 < np.count_nonzero(sound) < LOOPS - 3
     words = [
         analyse(simulate(load_scenario(PAPER, settings_of(loop, seed)))).verdict.word for seed, loop in enumerate(loops)
     ]
     flattered = [loop for loop, word, is_well in zip(loops, words, sound, strict=True) if word in GREEN and not is_well]
     assert not flattered
-    assert sum(word in GREEN for word in words) >= 4
+    assert sum(word in GREEN for word in words) >= 3
