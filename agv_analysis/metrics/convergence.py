@@ -21,7 +21,13 @@ from agv_analysis.metrics.error_metrics import (
     sign_changes,
     wrapped,
 )
-from agv_analysis.metrics.initial_error import InitialError, against_twin, first_outage, until_first_outage
+from agv_analysis.metrics.initial_error import (
+    InitialError,
+    against_twin,
+    first_outage,
+    until_first_outage,
+    until_forgotten,
+)
 from agv_analysis.metrics.last_excursion import LastExcursion, last_excursion
 from agv_analysis.run import Floats, Run
 from agv_analysis.simulation.twin_on_reference import twin_on_reference
@@ -138,7 +144,8 @@ def _of_initial_error(
         return until_first_outage(run, body, twin), damped, None
     left = body_errors(twin.pose, run.pose)
     damped = damping(run.time, v, twin.speed, v_max, critical_time)
-    return against_twin(run, left), damped, np.hypot(left[:, 0], left[:, 1])
+    x, y, _ = until_forgotten(left).T
+    return against_twin(run, left), damped, np.hypot(x, y)
 
 
 def _after_settling(run: Run, initial: InitialError, distance: Floats) -> float | None:

@@ -206,6 +206,13 @@ def test_without_outages_the_papers_numbers_are_what_they_were(
         assert found.overshoot == pytest.approx(0.25, abs=1e-12)
 
 
+def test_an_error_that_had_settled_is_not_blamed_for_a_later_excursion() -> None:
+    found = convergence(run_of("controller.kx=300.0", "relay.uplink.p=0.2"))
+    assert found.settle_1cm_steps == 63
+    assert found.excursion is not None
+    assert (found.excursion.is_over, found.excursion.is_initial_error, found.excursion.after) == (False, False, 26)
+
+
 # -- what cannot be said -----------------------------------------------------------------------------------------------
 
 
