@@ -46,6 +46,9 @@ label { display: block; font-size: .85rem; color: var(--soft); margin-top: .3rem
 button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
 th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
 pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
+table:has(td + td)::before {
+  content: "right: the pinned setting"; display: table-caption; text-align: right; font-size: .85rem; color: var(--soft)
+}
 #lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
 .js-plotly-plot .main-svg text:not(.hovertext *) { fill: var(--ink) !important }
 .js-plotly-plot .gridlayer path { stroke: var(--line) !important }

@@ -68,7 +68,13 @@ def beside(panel: Panel, pinned: Panel | None) -> Panel:
     if pinned is not None:
         line = next(line for line in pinned.lines if line.role not in (REFERENCE, LIMIT))
         shown += (dataclasses.replace(line, name="pinned", role=OTHER),)
+        panel = dataclasses.replace(panel, y_range=_both(panel.y_range, pinned.y_range))
     return dataclasses.replace(panel, lines=shown)
+
+
+def _both(one: tuple[float, float] | None, other: tuple[float, float] | None) -> tuple[float, float] | None:
+    """A range that holds two others; None is everything."""
+    return None if one is None or other is None else (min(one[0], other[0]), max(one[1], other[1]))
 
 
 def summary_rows(run: Run) -> Iterator[tuple[str, str]]:

@@ -72,7 +72,8 @@ def panels(analysis: Observations) -> Iterator[Panel]:
     """All panels of a run; those that need the controller's gains only where these are known."""
     yield track(analysis.run)
     yield from time_panels(analysis.run)
-    yield outage_lengths(analysis)
+    if analysis.outages.uplink.count:
+        yield outage_lengths(analysis)
     if isinstance(analysis, Analysis) and not analysis.infeasible:
         yield unit_circle(analysis)
 
@@ -147,7 +148,8 @@ def age(run: Run) -> Panel:
         lines.append(Line("by receive time, of the command that acted", run.time, acted, DRIVEN, STEP))
     label = f"n_ul [{run.ts * 1e3:g} ms]"
     title = "Age of information: steps since the freshest pose that the edge holds"
-    return Panel("age", title, TIME, label, tuple(lines))
+    is_fresh = not any(line.y.any() for line in lines)
+    return Panel("age", title, TIME, label, tuple(lines), y_range=(-0.05, 1.0) if is_fresh else None)
 
 
 def _limit(name: str, run: Run, value: float) -> Line:
@@ -161,7 +163,7 @@ def _most(values: Floats) -> tuple[float, float] | None:
     if not finite.size:
         return None
     low, high = np.percentile(finite, [1.0, 99.0])
-    margin = 0.25 * (high - low) + 1e-6
+    margin = max(0.25 * (high - low), 0.01 * max(abs(low), abs(high)), 1e-6)
     return float(low - margin), float(high + margin)
 
 
