@@ -155,9 +155,9 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
             yield found.label, _judged(found.stable, escape(found.why))
     verdict = analysis.verdict
     yield "Verdict", f"[bold {colour_of(verdict)}]{verdict.word}[/] (by {verdict.criterion})"
-    yield "Margin", escape(verdict.margin)
     if verdict.word in GREEN:
-        yield "Because", escape(verdict.reason)
+        yield "Margin", escape(verdict.margin)
+    yield "Because", escape(verdict.reason)
     for note in analysis.nominal_notes:
         yield "Loss-free motion", escape(note)
 
