@@ -71,6 +71,15 @@ def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> N
     assert block in (REPOSITORY / "README.md").read_text()
 
 
+def test_the_page_of_the_report_has_every_key_of_the_json() -> None:
+    import agv_ncs
+
+    scenario = agv_ncs.load_scenario("config/outages.yaml", ["plant.duration=5.0"])
+    keys = agv_ncs.analyse(agv_ncs.simulate(scenario)).to_json()
+    pages = "".join((REPOSITORY / "docs" / page).read_text() for page in ("report.md", "convergence.md"))
+    assert [key for key in keys if f"`{key}`" not in pages] == []
+
+
 def test_the_python_of_the_readme_runs() -> None:
     (code,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
     short = code.replace('["controller.law', '["plant.duration=5.0", "controller.law')
