@@ -49,7 +49,7 @@ pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
 table:has(td + td)::before {
   content: "right: the pinned setting"; display: table-caption; text-align: right; font-size: .85rem; color: var(--soft)
 }
-@media (max-width: 600px) { th, td { padding-right: .4rem; font-size: .85rem; overflow-wrap: anywhere } }
+@media (max-width: 600px) { th, td { padding-right: .4rem; font-size: .85rem } td { overflow-wrap: anywhere } }
 #lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
 .js-plotly-plot .main-svg text:not(.hovertext *) { fill: var(--ink) !important }
 .js-plotly-plot .gridlayer path { stroke: var(--line) !important }
