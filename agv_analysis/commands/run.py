@@ -130,6 +130,7 @@ def _judged(ended: dict[str, Outcome], bag: Path | None) -> list[Vehicle]:
 
 def _print_fleet(vehicles: list[Vehicle]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from agv_analysis.runtime.fleet import instability
@@ -137,7 +138,7 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     table = Table(box=None, pad_edge=False)
     table.add_column("AGV", no_wrap=True)
     for heading in ("steps", "lost", "outage", "to 1 cm", "error [m]", "twins"):
-        table.add_column(heading, justify="right")
+        table.add_column(escape(heading), justify="right")
     table.add_column("verdict")
     for one in vehicles:
         table.add_row(

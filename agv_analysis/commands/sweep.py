@@ -127,13 +127,14 @@ def _write_reports(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None
 
 def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
     for axis in sweep.axes:
-        table.add_column(axis.name, justify="right")
+        table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
     for name in ("runs", "unstable", "probability", "95 % confidence", "to 1 cm [steps]", "peak [m]"):
-        table.add_column(name, justify="right")
+        table.add_column(escape(name), justify="right", no_wrap="%" in name)
     for row in rows:
         values = [row[axis.name] for axis in sweep.axes]
         table.add_row(

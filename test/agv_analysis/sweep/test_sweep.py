@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import re
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -264,6 +265,15 @@ def test_a_cluster_gives_the_same_numbers_and_survives_the_loss_of_a_worker() ->
         rows, complete = collect(sweep, None, one_lost_on_the_way, lambda done: None)
     assert complete
     assert repr(rows) == repr(expected)
+
+
+def test_the_table_names_its_units_and_fits_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    options = ["--set", "plant.duration=1.0", "--vary", "controller.kx=5,25", "--seeds", "2"]
+    said = CliRunner().invoke(main, ["sweep", PAPER, *options]).output
+    assert "[steps]" in said
+    assert "[m]" in said
+    assert re.search(r"^ +25 +2 +\d +\S+ +[\d.]+ \.\. [\d.]+ +47 +5$", said, re.MULTILINE), said
 
 
 def test_a_cluster_that_is_not_there_is_named() -> None:
