@@ -15,13 +15,18 @@ _PERIODS = 3
 def period_of(k: Steps, lost: Outcomes) -> int | None:
     """Smallest number of slots after which all outcomes repeat; None if there is none, or steps are missing.
 
-    `k` and `lost` of shape (N,). Outcomes that are all the same have no outages that could repeat.
+    `k` and `lost` of shape (N,). Outcomes that are all the same have no outages that could repeat. What comes before
+    the end of the first outage may be otherwise: a run begins with a pose that is known.
     """
     if np.any(np.diff(k) != 1) or np.count_nonzero(np.diff(lost)) < 2 * _PERIODS:
         return None
-    borders = np.zeros(len(lost), dtype=np.int64)
-    period = int(compiled(_smallest_period)(np.ascontiguousarray(lost), borders))
-    return period if _PERIODS * period <= len(lost) else None
+    ends = np.flatnonzero(lost[:-1] & ~lost[1:]) + 1
+    for begin in (0, int(ends[0])):
+        rest = np.ascontiguousarray(lost[begin:])
+        period = int(compiled(_smallest_period)(rest, np.zeros(len(rest), dtype=np.int64)))
+        if begin <= 2 * period and _PERIODS * period <= len(rest):
+            return period
+    return None
 
 
 def _smallest_period(lost: Outcomes, borders: NDArray[np.int64]) -> int:

@@ -137,7 +137,9 @@ def _of_exact_predictor(loop: LinearLoop, lost: Outcomes) -> _Found:
 def _of_period(loop: LinearLoop, lost: Outcomes, period: int) -> _Found:
     """By the multiplier of the outcomes' own period; that they go on so is as sure as the periods seen make it."""
     periods = len(lost) // period
-    growth = 2.0 * float(drop_sequence(loop, np.resize(lost, _whole(loop, period)), 1)[0]) / _whole(loop, period)
+    last = lost[-period:]
+    pattern = np.roll(last, -int(np.argmin(last)))  # from a reception on
+    growth = 2.0 * float(drop_sequence(loop, np.resize(pattern, _whole(loop, period)), 1)[0]) / _whole(loop, period)
     goes_on = (periods + 0.5) / (periods + 1.0)
     stable = growth < MARGINAL
     why = f"the outcomes repeat every {period} slots, {periods} times, and over their period the error " + (

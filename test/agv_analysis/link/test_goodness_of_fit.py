@@ -104,6 +104,9 @@ def test_the_period_of_outages(pattern: list[int], period: int | None) -> None:
     lost = np.resize(np.array(pattern, dtype=bool), 101)
     assert period_of(np.arange(101), lost) == period
     assert period_of(np.arange(101) + (np.arange(101) > 50), lost) is None  # a step is missing
+    if period is not None:  # the first pose is known, whatever the link does
+        begun = np.concatenate(([False], lost))
+        assert period_of(np.arange(102), begun) == period
     if period is not None:
         lost[50] = ~lost[50]
         assert period_of(np.arange(101), lost) is None
