@@ -86,7 +86,7 @@ def _most_likely_change(k: Steps, lost: Outcomes, segment: Segment) -> tuple[flo
     if length * _FEWEST > len(k):
         return None, segment.begin
     counts = _transitions_before(k, lost)
-    edges = np.linspace(0, len(k) - 1, len(k) // length + 1).astype(np.int64)
+    edges = np.linspace(0, len(k) - 1, min(len(k) // length + 1, len(k))).astype(np.int64)  # no block is empty
     blocks = np.diff(counts[:, edges], axis=1)
     observed = _gains(np.cumsum(blocks, axis=1))
     rng = np.random.default_rng(1)

@@ -58,3 +58,9 @@ def test_recordings_too_short_to_change(slots: int) -> None:
     found = stationarity(np.arange(slots), np.arange(slots) % 2 == 0)
     assert found.change_points == ()
     assert found.segments == ((0, slots),)
+
+
+@pytest.mark.parametrize("slots", [12, 20, 199])
+def test_a_short_recording_without_any_outage_shows_no_change(slots: int) -> None:
+    found = stationarity(np.arange(slots), np.zeros(slots, dtype=np.bool_))
+    assert (found.p_value, found.change_points) == (1.0, ())
