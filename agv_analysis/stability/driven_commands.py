@@ -50,6 +50,9 @@ _FEW = 0.1
 _SAME_GAIN = 1e-6
 """Largest difference of two gains that is none, relative to them."""
 
+_OWN = "these parameters"
+"""Words of a piece under the scenario's own."""
+
 _SAME_ERROR = 1e-6
 """Largest difference [m, rad] between a recorded error and the one that follows from track and pose, at the origin."""
 
@@ -267,7 +270,7 @@ def _piece(k: int, driven: Driven, scenario: Scenario) -> Piece:
             words.append(f"{_number(factor)} times the law's {name}")
     if unknown:
         words.append(f"{' and '.join(unknown)} that these errors do not tell")
-    return Piece(k, values, ", ".join(words) if words else "these parameters")
+    return Piece(k, values, ", ".join(words) if words else _OWN)
 
 
 def _limit_words(driven: float, own: float) -> str:
@@ -291,6 +294,11 @@ def _sentence(run: Run, k: NDArray[np.int64], wrong: NDArray[np.bool_], pieces: 
         return f"step {step} ({step * run.ts:.6g} s)"
 
     first, law = int(k[np.argmax(wrong)]), run.scenario.controller.law
+    if pieces and pieces[0].words == _OWN:  # the first command differs, so these were not driven there
+        return (
+            f"commands differ from the control law with these parameters from {at(first)} on, at errors so small that "
+            "they do not tell which gains were driven"
+        )
     if pieces:
         said = "; ".join(
             f"driven with {piece.words}" if i == 0 else f"from {at(piece.k)} on with {piece.words}"

@@ -156,6 +156,13 @@ def test_gains_that_change_and_change_back() -> None:
     )
 
 
+def test_errors_too_small_to_tell_the_gains_do_not_say_that_the_own_ones_were_driven() -> None:
+    small = recorded(scale=(6e-12, 5e-9, 5e-9))
+    found = driven_commands(sent(small, kanayama(small, 250.0)))
+    assert found.differs
+    assert found.sentence.endswith("on, at errors so small that they do not tell which gains were driven")
+
+
 def test_another_law_is_not_taken_for_kanayama_s() -> None:
     run = recorded()
     for command in (state_feedback(run, 2.0, 1.0, 2.0), np.random.default_rng(0).normal(size=(STEPS, 2))):
