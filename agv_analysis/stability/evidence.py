@@ -136,6 +136,8 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
         is_sure = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
         return _with_growth(common, growth, "late_and_lost", "" if is_sure else "the halves of the run do not agree")
     why = "messages were late, by no constant delay, which no criterion covers"
+    if has_late(run.downlink):
+        why = "commands were late, which no criterion covers"
     if run.is_late:
         why = "poses or commands came later than their slots say, which no criterion covers"
     of_ages = judgements["recorded_losses"].stable

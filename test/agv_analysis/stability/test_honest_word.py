@@ -183,3 +183,10 @@ def test_missed_deadlines_without_a_record_of_when_messages_came() -> None:
     found = analyse(dataclasses.replace(run, timing=timing))
     assert found.verdict.word == "unknown"
     assert "153 deadlines were missed" in found.verdict.reason
+
+
+def test_late_commands_are_called_late_commands() -> None:
+    """Each command is 6 steps late: a constant delay, but of the link that no criterion covers."""
+    found = analyse(simulate(load_scenario(PAPER, ["error_detector.track=line", "relay.downlink.delay=0.03"])))
+    assert found.verdict.word == "unknown"
+    assert found.verdict.reason == "commands were late, which no criterion covers"
