@@ -50,7 +50,7 @@ def _in_mean_square(analysis: Analysis, met: str) -> str:
         return f"The AGV keeps to its track on a radio link like this one; the worst that it met were {met}."
     return (
         f"The AGV keeps to its track on a radio link like this one, but not in every case: {met}, again and again, "
-        "would throw it off."
+        "would drive it away from its track."
     )
 
 

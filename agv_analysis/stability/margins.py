@@ -142,9 +142,9 @@ class Margins:
         """A sentence for each pair of criteria that say different things."""
         found = []
         if self.n_lifted is not None and (self._paper_has_no_bound or (self.n_paper or -1) > self.n_lifted):
-            said = "any number" if self.n_paper is None else f"up to {self.n_paper}"
+            said = "any number" if self.n_paper is None else str(self.n_paper)
             found.append(
-                f"the paper's test allows {said} of outages; a pose that is always {_steps(self.n_lifted + 1)} old "
+                f"the paper's test allows {said} lost updates in a row; a pose that is always {_steps(self.n_lifted + 1)} old "
                 "makes the error grow"
             )
         if self.n_paper is not None and self.n_bursts is not None and self.n_paper < self.n_bursts:
@@ -161,7 +161,7 @@ class Margins:
         p_square, p_sure = self.p_mean_square, self.p_almost_sure
         if p_square is not None and p_sure is not None and p_sure > p_square:
             found.append(
-                f"between {p_square:.4f} and {p_sure:.4f} of independent losses almost every run "
+                f"at loss rates between {p_square:.4f} and {p_sure:.4f} of independent losses almost every run "
                 "converges, but the mean square of the error grows: rare long outages dominate it"
             )
         return [*found, *self._against_twins()]

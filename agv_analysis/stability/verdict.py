@@ -155,6 +155,8 @@ def _by_criteria(evidence: Evidence) -> Verdict:
         left = "any number of" if evidence.n_bursts is None else str(evidence.n_bursts - evidence.n)
         plural = "s" if left != "1" else ""
         reason = f"any sequence of outages of up to {evidence.n} slots is survived"
+        if evidence.n == 0:
+            reason = "no update was lost, and the error dies out"
         sure = f"; {_of_link(evidence)}" if evidence.link is not None else ""
         return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{plural}", reason + sure)
     return _mean_square(evidence)
@@ -221,7 +223,9 @@ def _beyond(evidence: Evidence) -> str:
         return "outages of such a link have no longest one"
     if evidence.n_bursts is None or evidence.n <= evidence.n_bursts:
         return "any sequence of the outages seen is survived"
-    return f"the longest outage exceeds what any sequence of outages may have by {evidence.n - evidence.n_bursts}"
+    longer = evidence.n - evidence.n_bursts
+    slots = f"{longer} slot{'s' if longer != 1 else ''}"
+    return f"the longest outage is {slots} longer than what the loop survives in any order"
 
 
 def against_stability(evidence: Evidence) -> str:

@@ -87,8 +87,10 @@ class LinkConfidence:
             "undecided": "the recording does not show whether the mean square of the error dies out",
         }[worst.word]
         more = self.record_seconds_more
-        longer = "" if more is None else f"; about {more:g} s more of the like would decide it"
-        return f"{where}{said}: {worst.why} (it dies out with probability {worst.probability_stable:.3g}){longer}"
+        longer = "" if more is None else f"; recording about {more:g} s more would probably decide it"
+        return (
+            f"{where}{said}: {worst.why} (the error dies out with probability {worst.probability_stable:.3g}){longer}"
+        )
 
     def to_json(self) -> dict[str, Any]:
         """`confidence`, `growth_interval`, `record_seconds_more`, `stationarity`, and the segments."""

@@ -87,7 +87,11 @@ DRIFTS = dataclasses.replace(STAYS, stays=False, largest_deviation=40.0)
         (Evidence(n=13, n_bursts=14, growth=-0.1), "asymptotic", "1 more consecutive outage"),
         (Evidence(n=14, n_bursts=14, growth=-0.1), "asymptotic", "0 more consecutive outages"),
         (Evidence(n=10, n_bursts=None, growth=-0.1), "asymptotic", "any number of more consecutive outages"),
-        (Evidence(n=15, n_bursts=14, growth=-0.1, burst_left=2.0), "mean-square", "by 1; outages may become 2 times"),
+        (
+            Evidence(n=15, n_bursts=14, growth=-0.1, burst_left=2.0),
+            "mean-square",
+            "1 slot longer than what the loop survives in any order; outages may become 2 times",
+        ),
         (Evidence(n=10, n_bursts=14, growth=-0.1, is_unlimited=True), "mean-square", "no longest one"),
         (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0, repeated=STAYS), "bounded", "limit on the speed"),
         (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0, repeated=DRIFTS), "unstable", "mean square"),
