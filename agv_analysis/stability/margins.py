@@ -144,8 +144,8 @@ class Margins:
         if self.n_lifted is not None and (self._paper_has_no_bound or (self.n_paper or -1) > self.n_lifted):
             said = "any number" if self.n_paper is None else str(self.n_paper)
             found.append(
-                f"the paper's test allows {said} lost updates in a row; a pose that is always {_steps(self.n_lifted + 1)} old "
-                "makes the error grow"
+                f"the paper's test allows {said} lost updates in a row; a pose that is always "
+                f"{_steps(self.n_lifted + 1)} old makes the error grow"
             )
         if self.n_paper is not None and self.n_bursts is not None and self.n_paper < self.n_bursts:
             found.append(
