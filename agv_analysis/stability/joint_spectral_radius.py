@@ -39,6 +39,9 @@ UNDECIDED = "undecided"
 _APART = 1e-12
 """Entries of a step's matrix up to which it does not couple two states."""
 
+_ENOUGH = 500
+"""Losses in a row beyond which a burst is only tried if none of up to so many grows."""
+
 _ASKED, _ROUNDS = 24, 6
 """Maps that a common norm is searched for at a time, and how often others are added to them, if P has many entries."""
 
@@ -61,13 +64,19 @@ class BurstVerdict:
 
 
 def verdict(loop: LinearLoop, n_max: int) -> BurstVerdict:
-    """Verdict for arbitrary bursts of up to `n_max` >= 0 losses on a lap."""
-    growth = list(_repeated_growths(loop, n_max + 1))
+    """Verdict for arbitrary bursts of up to `n_max` >= 0 losses on a lap.
+
+    Bursts of more than `_ENOUGH` losses are only tried where no shorter one refutes: the maps of a lap take memory.
+    """
+    asked = 0 if loop.is_exact else n_max  # behind an exact predictor outages leave nothing of their own
+    growth = list(_repeated_growths(loop, min(asked, _ENOUGH) + 1))
+    if asked > _ENOUGH and max(growth) <= MARGINAL:
+        growth = list(_repeated_growths(loop, asked + 1))
     worst = int(np.argmax(growth))
     lower = math.exp(growth[worst])
     if growth[worst] > MARGINAL:
         return BurstVerdict(n_max, UNSTABLE, lower, math.inf, worst, None)
-    upper, certificate = _upper_bound(loop, n_max)
+    upper, certificate = _upper_bound(loop, asked)
     return BurstVerdict(n_max, STABLE if upper < 1.0 else UNDECIDED, lower, upper, worst, certificate)
 
 
@@ -86,6 +95,7 @@ def largest_n(loop: LinearLoop, limit: int = 1000) -> tuple[int | None, int | No
     The first is -1 if not even a loop without losses is proved stable, the second None if there is none up to `limit`;
     both None: stable up to `limit`. They are neighbours unless what lies between them is undecided.
     """
+    limit = 0 if loop.is_exact else limit  # an outage leaves nothing that its absence would not
     refuted = first_refuted(loop, limit)
     proved, beyond = -1, limit + 1 if refuted is None else refuted
     attempt = beyond - 1  # just below what is refuted: nearly always proved at once

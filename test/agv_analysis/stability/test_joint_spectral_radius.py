@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.criteria.criterion import RunFacts
 from agv_analysis.stability.joint_spectral_radius import (
     STABLE,
     UNDECIDED,
@@ -266,3 +267,19 @@ def test_without_outages_there_is_one_sequence_and_no_norm_is_needed() -> None:
     found = verdict(loop, 0)
     assert (found.verdict, found.certificate) == (STABLE, None)
     assert found.lower == found.upper == pytest.approx(math.sqrt(0.5), rel=1e-12)
+
+
+def test_an_outage_of_a_whole_lap_is_refuted_by_a_shorter_one() -> None:
+    """All maps of a lap for each of 20 000 lengths would take 28 GB."""
+    loop = RunFacts(simulate(load_scenario(CONFIG, []))).loop
+    found = verdict(loop, 19_999)
+    assert (found.n_max, found.verdict) == (19_999, UNSTABLE)
+    assert 14 < found.worst <= 500
+    assert found.lower > 1.0
+
+
+def test_behind_an_exact_predictor_no_outage_is_too_long() -> None:
+    loop = RunFacts(simulate(load_scenario(CONFIG, ["error_detector.policy=predict"]))).loop
+    assert loop.is_exact
+    assert verdict(loop, 19_999).verdict == STABLE
+    assert largest_n(loop, 19_999) == (None, None)
