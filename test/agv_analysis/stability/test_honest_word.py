@@ -190,3 +190,10 @@ def test_late_commands_are_called_late_commands() -> None:
     found = analyse(simulate(load_scenario(PAPER, ["error_detector.track=line", "relay.downlink.delay=0.03"])))
     assert found.verdict.word == "unknown"
     assert found.verdict.reason == "commands were late, which no criterion covers"
+
+
+def test_behind_an_exact_predictor_a_link_that_delivers_nothing_is_not_green() -> None:
+    """The first pose is known, and none comes after it: an open loop."""
+    found = of(LINE, "error_detector.policy=predict", "relay.uplink.model=bernoulli", "relay.uplink.p=1.0")
+    assert found.verdict.word not in GREEN
+    assert "nothing was received after the first pose" in found.verdict.reason
