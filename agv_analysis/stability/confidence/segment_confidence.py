@@ -129,8 +129,10 @@ def _judge(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals, goo
 def _of_exact_predictor(loop: LinearLoop, lost: Outcomes) -> _Found:
     if lost.all():
         return _Found(PREDICTED, 0.0, 0.0, (0.0, 0.0), None, "nothing was received")
-    if len(lost) > 1 and lost[1:].all():  # an open loop: that outages leave nothing holds when one ends
-        return _Found(PREDICTED, 0.5, 0.0, (0.0, 0.0), None, "nothing was received after the first pose")
+    since = int(np.argmin(lost[::-1]))  # slots since the last pose: that outages leave nothing holds when one ends
+    if since > len(lost) // 2:
+        why = f"nothing was received in the last {since} of {len(lost)} slots"
+        return _Found(PREDICTED, 0.5, 0.0, (0.0, 0.0), None, why)
     growth = mean_square.lap_growth(loop, bernoulli(0.0)) / loop.steps
     why = "the edge's model is exact, so that losses leave nothing of the error"
     return _Found(PREDICTED, float(growth < MARGINAL), growth, (growth, growth), None, why)
