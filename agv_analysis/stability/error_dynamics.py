@@ -334,7 +334,7 @@ def _what_it_does_instead(model: LoopModel, v_r: Floats, w_r: Floats) -> str:
     half = len(errors) // 2
     distance = np.hypot(errors[:, 0], errors[:, 1])
     drift = float(distance[-1] - distance[half]) / ((len(errors) - half) * ts)
-    if drift * (len(errors) - half) * ts > 0.5 * float(distance[half:].max()):
+    if drift * (len(errors) - half) * ts > 0.4 * float(distance[half:].max()):  # of a steady drift it is half
         return f"without any loss the AGV falls behind its reference by {drift:.3g} m/s for ever"
     spread = np.ptp(errors[half:], axis=0)
     return (

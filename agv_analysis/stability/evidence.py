@@ -10,6 +10,7 @@ import numpy as np
 
 from agv_analysis.link import joint_chain
 from agv_analysis.link.channel_fit import ChannelFit
+from agv_analysis.link.joint_chain import JointChain
 from agv_analysis.link.markov_channel import Chain, chain_of, gilbert_elliott
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
@@ -90,8 +91,12 @@ def _with_margin(evidence: Evidence, facts: RunFacts) -> Evidence:
     """With what only a green word asks for, and what takes longest: which outages any sequence may have, and longer."""
     if decide(evidence).word not in GREEN:
         return evidence
-    n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
-    found = replace(evidence, n_bursts=n_bursts)
+    if facts.loop.closed_form is None and not facts.loop.is_constant:  # half a minute for a number beside the word
+        is_survived = joint_spectral_radius.verdict(facts.loop, facts.n).verdict == joint_spectral_radius.STABLE
+        found = replace(evidence, n_bursts=facts.n if is_survived else -1, is_least=True)
+    else:
+        n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
+        found = replace(evidence, n_bursts=n_bursts)
     if evidence.link is None or decide(found).word != MEAN_SQUARE:
         return found
     return replace(found, burst_left=_burst_left(facts.fit, evidence.link, facts.loop))
@@ -114,8 +119,15 @@ def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evid
     found = evidence_of_run(facts, judgements_of(facts))
     found = replace(found, twins=None if twins is None else (twins.contracting, len(twins.contraction)))
     uplink, downlink = chain_of(scenario.relay.uplink), chain_of(scenario.relay.downlink)
-    if not facts.is_feasible or facts.is_late or uplink is None or downlink is None or downlink.loss_rate > 0.0:
+    if not facts.is_feasible or facts.is_late or uplink is None or downlink is None:
         return found
+    policy = scenario.plant.downlink_policy
+    if downlink.loss_rate > 0.0:
+        if policy not in mean_square_two_links.POLICIES:
+            return found
+        links = joint_chain.correlated(uplink, downlink, scenario.relay.downlink.correlation)
+        both = mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
+        return _with_growth(found, both, "both_links")
     growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
     known = replace(found, link=None, burst_left=None, is_unlimited=_is_random(uplink))
     return _with_margin(_with_growth(known, growth), facts)
@@ -166,13 +178,18 @@ def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, J
     if growth is None:
         why = f"commands were lost, and no criterion covers downlink policy {policy}"
         return replace(common, not_covered=why)
-    fits = facts.fit, facts.downlink_fit
 
-    def growth_at(end: int) -> float:
-        links = joint_chain.independent(*(_at_end(fit, end) for fit in fits))
+    def growth_under(links: JointChain) -> float:
         return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
 
-    is_sure = growth_at(-1 if growth < 0.0 else 0) * growth > 0.0
+    if joint_chain.fitted(run.lost, run.downlink_lost) is None:
+        end = -1 if growth < 0.0 else 0
+        others = [joint_chain.independent(*(_at_end(fit, end) for fit in (facts.fit, facts.downlink_fit)))]
+    else:  # links that fail together have no intervals of their own
+        halves = np.array_split(np.arange(len(run)), 2)
+        found = (joint_chain.fitted(run.lost[rows], run.downlink_lost[rows]) for rows in halves)
+        others = [links for links in found if links is not None]
+    is_sure = bool(others) and all(growth_under(links) * growth > 0.0 for links in others)
     unsure = "" if is_sure else "too few outages of both links were seen to say whether the mean square dies out"
     return _with_growth(common, growth, "both_links", unsure)
 

@@ -98,11 +98,13 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
     count = min(max(3, math.ceil(SECONDS / (steps * run.ts))), max(3, _MOST_STEPS // steps))
     reference = _repeated_reference(run.scenario, run.reference, count)
     starts, columns = _starts(run.scenario, run.pose[0], run.reference[0]), _moved_by_commands(loop)
-    beside = (_start(run.scenario, run.pose[0, :3] + offset) for offset in _BESIDE)
     settles = all(
-        _settles(_without_losses(run.scenario, reference, start, count * steps), reference, run.scenario, loop)
-        for start in (starts[0], *beside)
-    )
+        _settles(
+            _without_losses(run.scenario, reference, _start(run.scenario, run.pose[0, :3] + offset), count * steps),
+            reference, run.scenario, loop, may_be_elsewhere=offset != 0.0,
+        )
+        for offset in (0.0, *_BESIDE)
+    )  # fmt: skip
     meets, thirds, in_run = True, [], np.zeros(0)
     for shift in _shifts(run):
         begun = _under_losses(run, reference, starts[0], count, shift)
@@ -284,7 +286,8 @@ def _is_small_or_shrinks(distances: Sequence[Floats], small: float) -> bool:
     return math.isfinite(found[-1]) and (max(found[-2:]) <= small or shrinks)
 
 
-def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearLoop) -> bool:
+def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearLoop, may_be_elsewhere: bool) -> bool:
+    """Does a loop settle on its nominal motion, or, if it may, on another one that repeats itself over a lap?"""
     if not np.isfinite(poses).all():
         return False
     ahead, columns = scenario.controller.steps_ahead, _moved_by_commands(loop)
@@ -296,7 +299,18 @@ def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearL
         error[:, 2] = wrapped(error[:, 2])
         return np.asarray(np.abs(error[:, columns]).max(axis=1))
 
-    return _is_small_or_shrinks([distance(rows) for rows in _moments(len(poses))], _SETTLED)
+    if _is_small_or_shrinks([distance(rows) for rows in _moments(len(poses))], _SETTLED):
+        return True
+    return may_be_elsewhere and _repeats(body_errors(reference[ahead : ahead + len(poses)], poses), loop)
+
+
+def _repeats(errors: Floats, loop: LinearLoop) -> bool:
+    """Are the errors of the last lap those of the lap before, where the loop is constant those of the step before?"""
+    lag = 1 if loop.is_constant else loop.steps
+    last, before = errors[-loop.steps :], errors[-loop.steps - lag : -lag]
+    change = last - before
+    change[:, 2] = wrapped(change[:, 2])
+    return float(np.abs(change).max()) <= _SETTLED * (1.0 if lag > 1 else 1e-3)
 
 
 def _meets(one: Floats, other: Floats, columns: NDArray[np.int64]) -> bool:

@@ -75,6 +75,8 @@ class Evidence:
     """The longest outage, or the oldest pose [slots]."""
     n_bursts: int | None = None
     """The longest outages that are proved to be survived in any order [slots]; None: all."""
+    is_least: bool = False
+    """Is `n_bursts` what is known to be survived, and nothing known beyond?"""
     is_unlimited: bool = False
     """Have outages no longest one, so that no proof for outages up to `n` covers the link?"""
     growth: float | None = None
@@ -153,7 +155,8 @@ def _by_criteria(evidence: Evidence) -> Verdict:
         return _not_stable(evidence, evidence.growth_of, _grows(evidence))
     if evidence.growth_of == "mean_square" and is_survived and not evidence.is_unlimited:
         left = "any number of" if evidence.n_bursts is None else str(evidence.n_bursts - evidence.n)
-        plural = "s" if left != "1" else ""
+        left = "at least " + left if evidence.is_least else left
+        plural = "s" if evidence.n_bursts is None or evidence.n_bursts - evidence.n != 1 else ""
         reason = f"any sequence of outages of up to {evidence.n} slots is survived"
         if evidence.n == 0:
             reason = "no update was lost, and the error dies out"
@@ -223,6 +226,8 @@ def _beyond(evidence: Evidence) -> str:
         return "outages of such a link have no longest one"
     if evidence.n_bursts is None or evidence.n <= evidence.n_bursts:
         return "any sequence of the outages seen is survived"
+    if evidence.is_least:
+        return "the longest outage is not proved to be survived in any order"
     longer = evidence.n - evidence.n_bursts
     slots = f"{longer} slot{'s' if longer != 1 else ''}"
     return f"the longest outage is {slots} longer than what the loop survives in any order"

@@ -18,8 +18,9 @@ from agv_analysis.stability.criteria.criterion import (
 )
 from agv_analysis.stability.linear_loop import LinearLoop
 
-_PLACES = 2000
-"""Places of a lap, at least, where a run is judged; all of them would take several seconds."""
+_PLACES, _FEWEST, _WORK = 2000, 50, 5e6
+"""Places of a lap at which a run is judged, at most and at least, and numbers to be moved over them, see `work`: all
+places would take minutes."""
 
 _NAME, _LABEL = "late_poses.mean_square_growth", "Late and lost poses as they are, mean square"
 
@@ -44,7 +45,9 @@ def growths_of_halves(facts: RunFacts) -> tuple[float | None, float | None]:
 
 
 def _growth(facts: RunFacts, rows: slice) -> float | None:
-    ages, loop = fitted_ages(facts.run.n_ul[rows]), facts.loop.thinned(_PLACES)
+    ages = fitted_ages(facts.run.n_ul[rows])
+    share = _WORK / max(1.0, delayed_mean_square.work(facts.loop, ages))
+    loop = facts.loop.thinned(min(_PLACES, max(_FEWEST, round(share * facts.loop.steps))))
     return None if _why_not(loop, ages) else delayed_mean_square.lap_growth(loop, ages) / loop.steps
 
 

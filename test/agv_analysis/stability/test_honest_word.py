@@ -199,3 +199,28 @@ def test_behind_an_exact_predictor_a_link_that_stays_silent_is_not_green(first: 
     found = of(LINE, "error_detector.policy=predict", *silent)
     assert found.verdict.word == "undecided"
     assert f"nothing was received in the last {20_000 - first} of 20000 slots" in found.verdict.reason
+
+
+# -- two links --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("share", "word"), [(1.0, "mean-square"), (0.0, "unstable")])
+def test_links_that_fail_together_are_easier_to_bear(share: float, word: str) -> None:
+    """Half of all lost on both links, K_x = 130: with one fate for both E[e^2] dies out, with two it grows (THEORY)."""
+    links = [f"relay.{link}.{setting}" for link in ("uplink", "downlink") for setting in ("model=bernoulli", "p=0.5")]
+    settings = ("error_detector.track=circle", "controller.kx=130.0", *links, f"relay.downlink.correlation={share}")
+    assert of(*settings).verdict.word == word
+    assert decide(evidence_of_scenario(scenario_of(*settings))).word == word
+
+
+def test_an_agv_that_settles_elsewhere_from_elsewhere_is_not_called_unstable() -> None:
+    """Beside the line, and turned, pure pursuit drives the track backwards: another steady motion, not a swing."""
+    ahead = [f"{node}.look_ahead=0.5" for node in ("error_detector", "controller", "plant", "relay")]
+    assert of(LINE, "controller.law=pure_pursuit", *ahead).verdict.word == "asymptotic"
+
+
+def test_a_steady_drift_is_called_one() -> None:
+    """A slip of 10 % of 1.05 m/s leaves 0.945 m/s for a reference of 1 m/s."""
+    found = of(LINE, "controller.v_max=1.05", "plant.slip=0.1")
+    assert found.verdict.word == "infeasible"
+    assert "falls behind its reference by 0.055 m/s" in found.verdict.reason
