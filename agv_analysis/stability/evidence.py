@@ -67,6 +67,11 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
 
     Raises PartError if a part raises.
     """
+    return _with_margin(_evidence(facts, judgements), facts, judgements)
+
+
+def _evidence(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
+    """All that decides the word."""
     run, missing = facts.run, sum(facts.run.unexplained.values())
     common = Evidence(
         n=facts.n, v_max=run.scenario.controller.v_max, infeasible=facts.infeasible, missing=missing
@@ -81,19 +86,18 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
     if run.downlink_lost.any():
         return _of_both_links(common, facts, judgements)
     if _loses_nothing(run):
-        return _with_margin(_with_growth(common, float(judgements["mean_square"].detail[0])), facts)
+        return _with_growth(common, float(judgements["mean_square"].detail[0]))
     link = link_confidence(facts.loop, run.k, run.lost, run.ts)
-    sure = replace(common, growth=link.growth, link=link, probability_stable=link.probability_stable)
-    return _with_margin(sure, facts)
+    return replace(common, growth=link.growth, link=link, probability_stable=link.probability_stable)
 
 
-def _with_margin(evidence: Evidence, facts: RunFacts) -> Evidence:
+def _with_margin(evidence: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
     """With what only a green word asks for, and what takes longest: which outages any sequence may have, and longer."""
-    if decide(evidence).word not in GREEN:
+    is_of_outages = evidence.growth is not None and evidence.growth_of == "mean_square"
+    if not is_of_outages or decide(evidence).word not in GREEN:
         return evidence
     if facts.loop.closed_form is None and not facts.loop.is_constant:  # half a minute for a number beside the word
-        is_survived = joint_spectral_radius.verdict(facts.loop, facts.n).verdict == joint_spectral_radius.STABLE
-        found = replace(evidence, n_bursts=facts.n if is_survived else -1, is_least=True)
+        found = replace(evidence, n_bursts=facts.n if judgements["bursts"].stable else -1, is_least=True)
     else:
         n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
         found = replace(evidence, n_bursts=n_bursts)
@@ -116,11 +120,12 @@ def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evid
     """
     run = simulate(with_an_end(scenario))
     facts = RunFacts(run)
-    found = evidence_of_run(facts, judgements_of(facts))
+    judgements = judgements_of(facts)
+    found = _evidence(facts, judgements)
     found = replace(found, twins=None if twins is None else (twins.contracting, len(twins.contraction)))
     uplink, downlink = chain_of(scenario.relay.uplink), chain_of(scenario.relay.downlink)
     if not facts.is_feasible or facts.is_late or uplink is None or downlink is None:
-        return found
+        return _with_margin(found, facts, judgements)
     policy = scenario.plant.downlink_policy
     if downlink.loss_rate > 0.0:
         if policy not in mean_square_two_links.POLICIES:
@@ -129,8 +134,8 @@ def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evid
         both = mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
         return _with_growth(found, both, "both_links")
     growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
-    known = replace(found, link=None, burst_left=None, is_unlimited=_is_random(uplink))
-    return _with_margin(_with_growth(known, growth), facts)
+    known = replace(found, link=None, is_unlimited=_is_random(uplink))
+    return _with_margin(_with_growth(known, growth), facts, judgements)
 
 
 def _is_random(chain: Chain) -> bool:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.compiled import numbers
 from agv_analysis.metrics.error_metrics import body_errors, wrapped
+from agv_analysis.metrics.outages import ages
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links
@@ -206,7 +207,7 @@ def _under_losses(run: Run, reference: Floats, start: Loop, count: int, shift: i
     inputs = RunInputs(numbers(lost), numbers(downlink_lost), start, settings_of(run.scenario))
     if not _is_late(run):
         return _direct(run.scenario, reference, inputs)
-    up, down = (_link(age, count) for age in (_uplink_ages(run), _downlink_ages(run)))
+    up, down = (_link(age, count) for age in (run.command_age, _downlink_ages(run)))
     traces, rows = (empty_trace(len(lost)), empty_trace(len(lost))), np.full((len(lost), 8), math.nan)
     parts = replacements_of(run.scenario)
     run_parts(history_over_links, parts, numbers(reference), inputs, up, down, *traces, rows)
@@ -231,23 +232,13 @@ def _does_not_grow(before: float, last: float) -> bool:
 
 def _is_late(run: Run) -> bool:
     """Is what the receivers hold older than the outcomes of the slots say?"""
-    first, since = int(run.k[0]), np.arange(len(run))
-    pairs = (_uplink_ages(run), run.lost), (_downlink_ages(run), run.downlink_lost)
-    return any(not np.array_equal(np.minimum(age, since), _ages_of(lost, first)) for age, lost in pairs)
-
-
-def _uplink_ages(run: Run) -> NDArray[np.int64]:
-    """Of a run whose messages came later than their slots say the whole age of what acted."""
-    return run.command_age
-
-
-def _ages_of(lost: NDArray[np.bool_], first: int) -> NDArray[np.int64]:
-    k = np.arange(first, first + len(lost))
-    return np.asarray(k - np.maximum.accumulate(np.where(lost, first, k)), dtype=np.int64)
+    since = np.arange(len(run))
+    pairs = (run.command_age, run.lost), (_downlink_ages(run), run.downlink_lost)
+    return any(not np.array_equal(np.minimum(age, since), ages(run.k, lost)) for age, lost in pairs)
 
 
 def _downlink_ages(run: Run) -> NDArray[np.int64]:
-    return _ages_of(run.downlink_lost, int(run.k[0])) if run.n_dl is None else run.n_dl
+    return ages(run.k, run.downlink_lost) if run.n_dl is None else run.n_dl
 
 
 def _link(age: NDArray[np.int64], count: int) -> LinkInputs:
@@ -301,14 +292,14 @@ def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearL
 
     if _is_small_or_shrinks([distance(rows) for rows in _moments(len(poses))], _SETTLED):
         return True
-    return may_be_elsewhere and _repeats(body_errors(reference[ahead : ahead + len(poses)], poses), loop)
+    return may_be_elsewhere and _repeats(poses, reference[ahead : ahead + len(poses)], loop)
 
 
-def _repeats(errors: Floats, loop: LinearLoop) -> bool:
+def _repeats(poses: Floats, compared: Floats, loop: LinearLoop) -> bool:
     """Are the errors of the last lap those of the lap before, where the loop is constant those of the step before?"""
     lag = 1 if loop.is_constant else loop.steps
-    last, before = errors[-loop.steps :], errors[-loop.steps - lag : -lag]
-    change = last - before
+    errors = body_errors(compared[-loop.steps - lag :], poses[-loop.steps - lag :])
+    change = errors[lag:] - errors[:-lag]
     change[:, 2] = wrapped(change[:, 2])
     return float(np.abs(change).max()) <= _SETTLED * (1.0 if lag > 1 else 1e-3)
 

@@ -129,7 +129,7 @@ def decide(evidence: Evidence) -> Verdict:
         reason = evidence.contradictions[0]
         return Verdict(UNKNOWN, "recording", f"unknown: {reason}", reason)
     word = _by_criteria(evidence)
-    against = against_stability(evidence)
+    against = _against_stability(evidence)
     if word.word in (*GREEN, UNDECIDED, UNKNOWN) and against:
         return _not_stable(evidence, SIMULATION, against)
     return word
@@ -233,7 +233,7 @@ def _beyond(evidence: Evidence) -> str:
     return f"the longest outage is {slots} longer than what the loop survives in any order"
 
 
-def against_stability(evidence: Evidence) -> str:
+def _against_stability(evidence: Evidence) -> str:
     """What the simulation of the nonlinear loop says against a stable one; empty if nothing."""
     repeated, twins = evidence.repeated, evidence.twins
     if repeated is not None:
