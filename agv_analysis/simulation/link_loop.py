@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import numbers
 from agv_analysis.simulation.loop import (
     EdgeOutput,
     EdgeState,
@@ -43,6 +44,7 @@ from agv_analysis.simulation.loop import (
 )
 from agv_cloud.staleness.estimate import staleness_policy
 from agv_plant.channels.position_dependent import EVERYWHERE, outcome_at
+from agv_plant.random_stream import DRAWS
 from agv_ros.pose import Pose
 
 
@@ -81,6 +83,18 @@ def empty_trace(steps: int) -> LinkTrace:
         np.zeros(steps, dtype=np.bool_), np.zeros(steps, dtype=np.int64), np.full(steps, math.nan),
         np.zeros(steps, dtype=np.int64),
     )  # fmt: skip
+
+
+def link_that_holds(held: NDArray[np.int64]) -> LinkInputs:
+    """A link on which the receiver holds, after slot k, the message of step `held[k]` <= k, never an older one later.
+
+    Messages that it never holds are lost. `held` has shape (N,).
+    """
+    news = np.flatnonzero(np.diff(held, prepend=-1))
+    lost, waits = np.ones(len(held), dtype=np.bool_), np.zeros(len(held), dtype=np.int64)
+    lost[held[news]], waits[held[news]] = False, news - held[news]
+    nowhere, unused, random = np.zeros((0, 5)), np.zeros((len(held), 2)), np.zeros((len(held), DRAWS))
+    return LinkInputs(numbers(lost), EVERYWHERE, numbers(nowhere), numbers(unused), numbers(random), numbers(waits))
 
 
 def transmit(link: LinkInputs, trace: LinkTrace, k: int, x: float, y: float) -> int:

@@ -10,14 +10,12 @@ import numpy as np
 from agv_analysis.compiled import numbers
 from agv_analysis.metrics.outages import Outcomes, Steps, ages
 from agv_analysis.run import Floats, Run
-from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links
+from agv_analysis.simulation.link_loop import empty_trace, history_over_links, link_that_holds
 from agv_analysis.simulation.loop import Loop, RunInputs, history
 from agv_analysis.simulation.noise import normals
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.single import settings_of, start_of
-from agv_plant.channels.position_dependent import EVERYWHERE
-from agv_plant.random_stream import DRAWS
 from agv_plant.vehicle.motion import NOISE, SLIP
 from agv_ros.errors import UserError
 from agv_ros.pose import Pose
@@ -65,7 +63,7 @@ def _driven(run: Run, start: Loop) -> tuple[Floats, Floats]:
     if _is_direct(run.k, lost, run.n_ul) and _is_direct(run.k, downlink_lost, n_dl):
         run_parts(history, parts, reference, inputs, rows, np.empty(steps, dtype=np.int64))
     else:
-        links = _link_of(run.k, run.n_ul), _link_of(run.k, n_dl)
+        links = (link_that_holds(np.maximum(run.k - age, 0)) for age in (run.n_ul, n_dl))
         run_parts(
             history_over_links, parts, reference, inputs, *links, empty_trace(steps), empty_trace(steps), rows
         )  # fmt: skip
@@ -75,18 +73,6 @@ def _driven(run: Run, start: Loop) -> tuple[Floats, Floats]:
 def _is_direct(k: Steps, lost: Outcomes, age: Steps) -> bool:
     """Did each message that was not lost arrive in its own slot?"""
     return not lost[0] and bool(np.array_equal(age, ages(k, lost)))
-
-
-def _link_of(k: Steps, age: Steps) -> LinkInputs:
-    """A link on which the receiver holds, after each slot, a message that is `age` steps old."""
-    held = np.maximum(k - age, 0)
-    news = np.flatnonzero(np.diff(held, prepend=-1))
-    lost, waits = np.ones(len(k), dtype=np.bool_), np.zeros(len(k), dtype=np.int64)
-    lost[held[news]], waits[held[news]] = False, k[news] - held[news]
-    nowhere, unused = np.empty((0, 5)), np.empty((len(k), 2))
-    return LinkInputs(
-        numbers(lost), EVERYWHERE, numbers(nowhere), numbers(unused), numbers(np.empty((len(k), DRAWS))), numbers(waits)
-    )
 
 
 def _reference(run: Run) -> Floats:

@@ -27,15 +27,13 @@ from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.metrics.outages import ages
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
-from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links
+from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links, link_that_holds
 from agv_analysis.simulation.loop import Loop, RunInputs, history
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.single import settings_of, start_of
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of
-from agv_plant.channels.position_dependent import EVERYWHERE
 from agv_plant.parameters import RelayParameters
-from agv_plant.random_stream import DRAWS
 from agv_ros.pose import Pose
 
 SECONDS = 600.0
@@ -244,18 +242,11 @@ def _downlink_ages(run: Run) -> NDArray[np.int64]:
 def _link(age: NDArray[np.int64], count: int) -> LinkInputs:
     """A link under which the receiver holds, at each step of each repetition, a message of the age given, shape (N,).
 
-    Messages that never become the freshest are lost; at the beginning of a repetition nothing older than it is held.
+    At the beginning of a repetition nothing older than it is held.
     """
     steps = len(age)
     within = np.arange(steps) - np.minimum(age, np.arange(steps))
-    held = np.maximum.accumulate(np.concatenate([within + i * steps for i in range(count)]))
-    taken, at = np.unique(held, return_index=True)
-    lost, waits = np.ones(count * steps, dtype=np.bool_), np.zeros(count * steps, dtype=np.int64)
-    lost[taken], waits[taken] = False, at - taken
-    return LinkInputs(
-        numbers(lost), EVERYWHERE, numbers(np.zeros((0, 5))), numbers(np.zeros((len(lost), 2))),
-        numbers(np.zeros((len(lost), DRAWS))), numbers(waits),
-    )  # fmt: skip
+    return link_that_holds(np.maximum.accumulate(np.concatenate([within + i * steps for i in range(count)])))
 
 
 def _deviation(poses: Floats, reference: Floats) -> Floats:
