@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 
@@ -11,3 +12,15 @@ class Pose(NamedTuple):
     x: float
     y: float
     theta: float
+
+
+class Direction(NamedTuple):
+    """The direction of a heading: its cosine and sine."""
+
+    cos: float
+    sin: float
+
+
+def direction_of(theta: float) -> Direction:
+    """Of a heading [rad]."""
+    return Direction(math.cos(theta), math.sin(theta))

@@ -22,6 +22,7 @@ from agv_analysis.simulation.loop import (
     Rows,
     Settings,
     are_finite,
+    at_rest,
     edge_step,
     reference_at,
     with_pose,
@@ -36,7 +37,7 @@ from agv_cloud.parameters import PATH
 from agv_cloud.staleness.registry import HOLD, number_of
 from agv_ros.errors import UserError
 from agv_ros.parts import PartError
-from agv_ros.pose import Pose
+from agv_ros.pose import Pose, direction_of
 
 TOLERANCE = 1e-9
 """Largest difference that is none, as a share of the recorded value where that is above 1."""
@@ -143,7 +144,7 @@ def answer_poses(
     `row_at` is the row of each step, -1 for none, and `reference` X_r at each step, from the first of `k` on.
     `reached[0]` is the row that was begun last.
     """
-    edge, first = EdgeState(Pose(0.0, 0.0, 0.0), Pose(0.0, 0.0, 0.0), 0, 0.0, 0.0, memory), k[0]
+    edge, first = at_rest(0.0, 0.0, 0.0, (), memory).edge, k[0]
     now, taken = -1, -1  # the step that the edge's estimate is for, and that at which its pose was taken
     for i in range(len(k)):
         if held[i] < 0:
@@ -152,7 +153,7 @@ def answer_poses(
         if k[held[i]] != taken or k[i] < now:
             now = taken = k[held[i]]
             x, y, theta = poses[held[i]]
-            edge = with_pose(edge, Pose(x, y, theta), reference_at(reference, taken - first))
+            edge = with_pose(edge, Pose(x, y, theta), direction_of(theta), reference_at(reference, taken - first))
         if not settings.is_stepwise:
             now = max(now, k[i] - 1)
         while now < k[i]:
@@ -160,11 +161,11 @@ def answer_poses(
             v, w = edge.v, edge.w
             if row >= 0 and are_finite(sent[row][0], sent[row][1], 0.0):
                 v, w = sent[row]
-            edge = EdgeState(edge.held, edge.target, edge.n_ul, v, w, edge.memory)
+            edge = EdgeState(edge.held, edge.direction, edge.target, edge.n_ul, v, w, edge.memory)
             edge = without_pose(edge, reference_at(reference, now + 1 - first), settings)
             now += 1
         answer, after = edge_step(edge, reference_at(reference, k[i] - first), settings)
-        edge = EdgeState(edge.held, edge.target, edge.n_ul, edge.v, edge.w, after)
+        edge = EdgeState(edge.held, edge.direction, edge.target, edge.n_ul, edge.v, edge.w, after)
         rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4] = answer
 
 

@@ -45,7 +45,7 @@ from agv_analysis.simulation.loop import (
 from agv_cloud.staleness.estimate import staleness_policy
 from agv_plant.channels.position_dependent import EVERYWHERE, outcome_at
 from agv_plant.random_stream import DRAWS
-from agv_ros.pose import Pose
+from agv_ros.pose import Pose, direction_of
 
 
 class LinkInputs(NamedTuple):
@@ -216,7 +216,7 @@ def at_the_edge(edge: EdgeState, k: int, taken: int, reference: Rows, past: Past
         held, target = staleness_policy(
             settings.policy, held, target, compared, v, w, settings.ts, settings.model_arc, settings.policy_parameters
         )
-    return EdgeState(held, target, k - taken, edge.v, edge.w, edge.memory)
+    return EdgeState(held, direction_of(held.theta), target, k - taken, edge.v, edge.w, edge.memory)
 
 
 # -- whole runs --------------------------------------------------------------------------------------------------------

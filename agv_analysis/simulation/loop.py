@@ -24,11 +24,11 @@ from agv_cloud.control.command import command
 from agv_cloud.control.command_plan import next_error
 from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.staleness.estimate import staleness_policy
-from agv_cloud.tracking_error import tracking_error
+from agv_cloud.tracking_error import tracking_error_along
 from agv_plant.downlink_policy import share_of_command
 from agv_plant.vehicle.motion import Motion, VehicleParameters, measured, move
 from agv_plant.vehicle.unicycle import integrate
-from agv_ros.pose import Pose
+from agv_ros.pose import Direction, Pose, direction_of
 
 Rows = NDArray[np.float64] | list[list[float]]
 Flags = NDArray[np.bool_] | list[bool]
@@ -69,6 +69,8 @@ class EdgeState(NamedTuple):
 
     held: Pose
     """The pose that it takes for the AGV's."""
+    direction: Direction
+    """That of its heading, computed once for as long as it is held."""
     target: Pose
     """The pose that it compares this with."""
     n_ul: int
@@ -138,7 +140,7 @@ def at_rest(x: float, y: float, theta: float, states: Numbers = (), memory: Numb
     pose = Pose(x, y, theta)
     return Loop(
         Motion(x, y, theta, 0.0, 0.0, 0.0, states),
-        EdgeState(pose, pose, 0, 0.0, 0.0, memory),
+        EdgeState(pose, direction_of(theta), pose, 0, 0.0, 0.0, memory),
         HeldCommand(0.0, 0.0, 0),
         PlanState(0.0, 0.0, 0.0, memory),
     )
@@ -150,15 +152,15 @@ def at_rest(x: float, y: float, theta: float, states: Numbers = (), memory: Numb
 def slot(loop: Loop, reference: ReferencePoint, inputs: RunInputs, k: int) -> tuple[Loop, EdgeOutput]:
     """From one pose to the next, under the outcomes of both links in slot k, with the reference as the edge sees it."""
     n_left, n_right = wheel_noise(inputs.slip, k)
+    # Computed before it is known whether the edge needs it: the plant does in any case, and so it is computed once.
+    direction = direction_of(loop.motion.theta)
     if inputs.lost[k]:
         edge = without_pose(loop.edge, reference, inputs.settings)
-        sent, memory = edge_step(edge, reference, inputs.settings)
-        held = Loop(loop.motion, edge, loop.command, loop.plan)
-        return plant_step(
-            held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings
-        ), sent  # fmt: skip
-    # The same again: here the compiler sees that edge and plant use one angle, and computes its sine only once.
-    edge = with_pose(loop.edge, sent_pose(loop.motion, inputs.noise, k, inputs.settings), reference)
+    else:
+        pose = sent_pose(loop.motion, inputs.noise, k, inputs.settings)
+        if inputs.noise is not None:
+            direction = direction_of(pose.theta)
+        edge = with_pose(loop.edge, pose, direction, reference)
     sent, memory = edge_step(edge, reference, inputs.settings)
     held = Loop(loop.motion, edge, loop.command, loop.plan)
     return plant_step(held, sent, memory, inputs.downlink_lost[k], n_left, n_right, reference, inputs.settings), sent
@@ -201,12 +203,15 @@ def without_pose(edge: EdgeState, reference: ReferencePoint, settings: Settings)
         settings.policy, edge.held, edge.target, reference, edge.v, edge.w, settings.ts, settings.model_arc,
         settings.policy_parameters,
     )  # fmt: skip
-    return EdgeState(held, target, edge.n_ul + 1, edge.v, edge.w, edge.memory)
+    direction = edge.direction
+    if settings.is_stepwise:
+        direction = direction_of(held.theta)
+    return EdgeState(held, direction, target, edge.n_ul + 1, edge.v, edge.w, edge.memory)
 
 
-def with_pose(edge: EdgeState, pose: Pose, reference: ReferencePoint) -> EdgeState:
-    """The edge holds the pose of now."""
-    return EdgeState(pose, Pose(reference.x, reference.y, reference.theta), 0, edge.v, edge.w, edge.memory)
+def with_pose(edge: EdgeState, pose: Pose, direction: Direction, reference: ReferencePoint) -> EdgeState:
+    """The edge holds the pose of now, whose heading has this direction."""
+    return EdgeState(pose, direction, Pose(reference.x, reference.y, reference.theta), 0, edge.v, edge.w, edge.memory)
 
 
 def edge_step(edge: EdgeState, reference: ReferencePoint, settings: Settings) -> tuple[EdgeOutput, Numbers]:
@@ -215,7 +220,9 @@ def edge_step(edge: EdgeState, reference: ReferencePoint, settings: Settings) ->
     An error that is not finite is refused by the controller, as one from the wire is.
     """
     held, target = edge.held, edge.target
-    x_e, y_e, theta_e = tracking_error(target.x, target.y, target.theta, held.x, held.y, held.theta)
+    x_e, y_e, theta_e = tracking_error_along(
+        target.x, target.y, target.theta, held.x, held.y, held.theta, edge.direction
+    )
     if not are_finite(x_e, y_e, theta_e):
         return EdgeOutput(x_e, y_e, theta_e, math.nan, math.nan), edge.memory
     v, w, memory = command(
@@ -237,7 +244,7 @@ def plant_step(
     edge, held = loop.edge, HeldCommand(sent.v, sent.w, 0)
     is_finite = are_finite(sent.v, sent.w, 0.0)
     if is_finite:
-        edge = EdgeState(edge.held, edge.target, edge.n_ul, sent.v, sent.w, memory)
+        edge = EdgeState(edge.held, edge.direction, edge.target, edge.n_ul, sent.v, sent.w, memory)
     if lost or not is_finite:
         held = HeldCommand(loop.command.v, loop.command.w, loop.command.n_dl + 1)
     v, w, plan = driven_command(loop, sent, memory, held, reference, settings.plan_arc, settings)

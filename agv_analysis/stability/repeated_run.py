@@ -34,7 +34,7 @@ from agv_analysis.simulation.single import settings_of, start_of
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of
 from agv_plant.parameters import RelayParameters
-from agv_ros.pose import Pose
+from agv_ros.pose import Pose, direction_of
 
 SECONDS = 600.0
 """Time [s] that is driven at least, in whole repetitions of the run, three of them at least."""
@@ -183,7 +183,8 @@ def _start(scenario: Scenario, at: Floats) -> Loop:
     x, y, theta = at[:3].tolist()
     start, pose = start_of(scenario), Pose(x, y, theta)
     return start._replace(
-        motion=start.motion._replace(x=x, y=y, theta=theta), edge=start.edge._replace(held=pose, target=pose)
+        motion=start.motion._replace(x=x, y=y, theta=theta),
+        edge=start.edge._replace(held=pose, direction=direction_of(theta), target=pose),
     )
 
 
