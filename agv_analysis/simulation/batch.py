@@ -103,6 +103,10 @@ class _Batch:
         self.table: Table = np.zeros((len(scenarios), len(seeds)), dtype=STATISTICS)
         self._scenarios, self._seeds, self._twins = scenarios, seeds, twins
         self._steps = [steps_of(scenario) for scenario in scenarios]
+        # What the runs of a scenario share, made when the first of them needs it.
+        self._settings = functools.cache(lambda row: settings_of(scenarios[row]))
+        self._start = functools.cache(lambda row: start_of(scenarios[row]))
+        self._on_reference = functools.cache(self._start_on_reference)
         # Runs of one kind share a reference and a compiled loop.
         kinds: dict[tuple[ErrorDetectorParameters, int, str, str], int] = {}
         self._kind = [
@@ -181,12 +185,13 @@ class _Batch:
 
     def _decay(self, reference: Floats, job: Job, inputs: RunInputs, parts: Replacements) -> Decay:
         """What becomes of the initial error of a run whose messages arrive at once or not at all."""
-        found: Decay = run_parts(decay, parts, reference, inputs, self._on_reference(reference, job))
+        found: Decay = run_parts(decay, parts, reference, inputs, self._on_reference(job[0]))
         return found
 
-    def _on_reference(self, reference: Floats, job: Job) -> Loop:
+    def _start_on_reference(self, row: int) -> Loop:
         """The loop before slot 0 with the AGV on its reference."""
-        return start_of(self._scenarios[job[0]], at=Pose(*(float(value) for value in reference[0][:3])))
+        first = self._reference(row)[0]
+        return start_of(self._scenarios[row], at=Pose(*(float(value) for value in first[:3])))
 
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay
@@ -202,7 +207,7 @@ class _Batch:
         up, down = empty_trace(steps), empty_trace(steps)
         found = run_parts(statistics_over_links, parts, reference, inputs, *links, up, down)
         held = [numbers(trace.held[: found.steps]) for trace in (up, down)]
-        of_start = run_parts(decay_over_links, parts, reference, inputs, self._on_reference(reference, job), *held)
+        of_start = run_parts(decay_over_links, parts, reference, inputs, self._on_reference(job[0]), *held)
         return found, of_start, (up, down)
 
     def _realisation(self, job: Job, realisations: Realisations) -> ChannelRealisation:
@@ -219,8 +224,8 @@ class _Batch:
         return RunInputs(
             numbers(realisation.outcomes(scenario.relay.uplink, "uplink")),
             numbers(realisation.outcomes(scenario.relay.downlink, "downlink")),
-            start_of(scenario),
-            settings_of(scenario),
+            self._start(job[0]),
+            self._settings(job[0]),
             numbers(realisation.normals(NOISE)) if scenario.plant.is_noisy else None,
             numbers(realisation.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,
         )
