@@ -130,10 +130,12 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from agv_analysis.report.table import metres
+
     table = Table(box=None, pad_edge=False)
     for axis in sweep.axes:
         table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
-    for name in ("runs", "unstable", "probability", "95 % confidence", "to 1 cm [steps]", "peak [m]"):
+    for name in ("runs", "unstable", "probability", "95 % confidence", "to 1 cm [steps]", "deviation"):
         table.add_column(escape(name), justify="right", no_wrap="%" in name)
     for row in rows:
         values = [row[axis.name] for axis in sweep.axes]
@@ -141,6 +143,6 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
             *(f"{value:.6g}" if isinstance(value, float) else str(value) for value in values),
             str(row["runs"]), str(row["unstable"]), f"{row['instability']:.3f}",
             f"{row['instability_low']:.3f} .. {row['instability_high']:.3f}", f"{row['settle_1cm_steps_p50']:g}",
-            f"{row['position_peak_p50']:.4g}",
+            metres(row["deviation_max_p50"]),
         )  # fmt: skip
     Console(highlight=False).print(table)

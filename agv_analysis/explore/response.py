@@ -9,8 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agv_analysis.metrics.convergence import convergence
+from agv_analysis.metrics.deviation import deviation
 from agv_analysis.report.panels import LIMIT, OTHER, REFERENCE, Panel, age, distance, speed, track
 from agv_analysis.report.plotly import figure
+from agv_analysis.report.table import at_most, deviation_sizes
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
@@ -82,7 +85,8 @@ def summary_rows(run: Run) -> Iterator[tuple[str, str]]:
     facts = RunFacts(run)
     e = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
     late = float(e[-max(1, len(e) // 10) :].max())
-    yield "Error in the last tenth", "; ".join((f"at most {late:.3g} m", *run.notes))
+    yield "Error in the last tenth", "; ".join((at_most(late), *run.notes))
+    yield "Deviation", deviation_sizes(deviation(run, convergence(run).initial))
     yield "Oldest pose", f"{facts.n} steps ({facts.n * run.ts * 1e3:g} ms)"
     if not facts.is_feasible:
         yield "Without losses", facts.infeasible

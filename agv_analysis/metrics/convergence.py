@@ -169,7 +169,8 @@ def damping(time: Floats, v: Floats, v_r: Floats, v_max: float, critical_time: f
     `critical_time` is over.
     """
     sent = np.isfinite(v)
-    time, v, d = time[sent], v[sent], v[sent] - v_r[sent]
+    with np.errstate(over="ignore"):
+        time, v, d = time[sent], v[sent], v[sent] - v_r[sent]
     band = SHARE * float(np.max(np.abs(d), initial=0.0))
     if band == 0.0:
         return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agv_analysis.metrics.bands import TOLERANCE
-from agv_analysis.metrics.outages import outage_begins, outage_lengths
+from agv_analysis.metrics.outages import longest_outage_between
 from agv_analysis.run import Floats, Run
 
 
@@ -38,16 +38,7 @@ def last_excursion(run: Run, distance: Floats, left: Floats | None) -> LastExcur
     first = int(inside_before[-1]) + 1 if len(inside_before) else 0
     is_over = last + 1 < len(run)
     seconds = float(run.time[last + 1 if is_over else last] - run.time[0])
-    outage = _outage_of(run, first, last)
+    outage = longest_outage_between(run, first, last)
     is_initial = first == 0 and outage is None if left is None else bool(left[last] >= 0.5 * distance[last])
-    return LastExcursion(seconds, is_over, None if is_initial else outage, is_initial)
-
-
-def _outage_of(run: Run, first: int, last: int) -> int | None:
-    """Longest outage of which a slot is felt from step `first` to step `last`: slot k is felt at step k + 1."""
-    longest = 0
-    for lost in (run.lost, run.downlink_lost):
-        begins, lengths = outage_begins(run.k, lost), outage_lengths(run.k, lost)
-        is_felt = (begins < last) & (begins + lengths >= first)
-        longest = max(longest, int(lengths[is_felt].max(initial=0)))
-    return longest or None
+    after = None if is_initial or outage is None else outage.slots
+    return LastExcursion(seconds, is_over, after, is_initial)

@@ -158,6 +158,36 @@ def outage_begins(k: Steps, lost: Outcomes) -> Steps:
     return np.asarray(np.flatnonzero(lost & ~_follows_lost(k, lost)), dtype=np.int64)
 
 
+@dataclass(frozen=True)
+class Outage:
+    """A series of consecutive lost slots of one link."""
+
+    link: str
+    """`uplink` or `downlink`."""
+    k: int
+    """Step of its first slot."""
+    slots: int
+    cause: str
+    """What lost its first message: the channel's model, or `outage` if its schedule says so; empty if unknown."""
+
+
+def longest_outage_between(run: Run, first: int, last: int) -> Outage | None:
+    """The longest outage, of either link, that acts in the rows `first` to `last` of a run; None without one.
+
+    A loss in slot k acts on the pose of step k + 1.
+    """
+    found = None
+    for link, lost, why in (("uplink", run.lost, run.uplink), ("downlink", run.downlink_lost, run.downlink)):
+        begins, lengths = outage_begins(run.k, lost), outage_lengths(run.k, lost)
+        acting = np.flatnonzero((begins < last) & (begins + lengths >= first))
+        if len(acting):
+            chosen = acting[np.argmax(lengths[acting])]
+            begin, slots = int(begins[chosen]), int(lengths[chosen])
+            if found is None or slots > found.slots:
+                found = Outage(link, int(run.k[begin]), slots, "" if why is None else str(why.cause[begin]))
+    return found
+
+
 def _follows_lost(k: Steps, lost: Outcomes) -> Outcomes:
     """Is the slot before each one known, and lost?"""
     return np.concatenate(([False], lost[:-1] & (np.diff(k) == 1)))

@@ -6,7 +6,21 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agv_analysis.report.panels import BARS, DRIVEN, LIMIT, LOST, MARKERS, OTHER, REFERENCE, STEP, Line, Panel, thinned
+from agv_analysis.report.panels import (
+    BARS,
+    DRIVEN,
+    LIMIT,
+    LOST,
+    MARKERS,
+    OTHER,
+    PEAK,
+    REFERENCE,
+    RINGS,
+    STEP,
+    Line,
+    Panel,
+    thinned,
+)
 from agv_ros.errors import UserError
 
 if TYPE_CHECKING:
@@ -23,7 +37,7 @@ STYLE: Any = {
     "svg.hashsalt": "agv_ncs",  # the same bytes for the same run
 }
 
-COLOURS = {REFERENCE: "#7f7f7f", DRIVEN: "#1f6fb4", LOST: "#d62728", OTHER: "#e08214", LIMIT: "black"}
+COLOURS = {REFERENCE: "#7f7f7f", DRIVEN: "#1f6fb4", LOST: "#d62728", OTHER: "#e08214", LIMIT: "black", PEAK: "#7b3fb5"}
 
 _MOST_POINTS = 4000
 """Points of a line: more than a printer can show in a column."""
@@ -69,6 +83,8 @@ def _draw_line(axes: Axes, line: Line) -> None:
         axes.bar(line.x, line.y, color=colour, label=line.name)
     elif line.style == MARKERS:
         axes.plot(line.x, line.y, ".", color=colour, ms=2.0, label=line.name, rasterized=len(line.x) > _MOST_POINTS)
+    elif line.style == RINGS:
+        axes.plot(line.x, line.y, "o", color=colour, ms=6.0, mfc="none", mew=0.8, label=line.name)
     elif line.style == STEP:
         axes.step(line.x, line.y, where="post", color=colour, lw=0.6, label=line.name)
     else:

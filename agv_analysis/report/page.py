@@ -46,7 +46,7 @@ def write_page(html: str, path: Path) -> None:
 
 def render(analysis: Observations) -> str:
     """The report of a run as HTML. Raises UserError if plotly or jinja2 is not installed."""
-    drawn = list(panels(analysis))
+    drawn, figures = list(panels(analysis)), dict(_rows(analysis))
     return fill(
         "report.html.j2",
         figures={key: figure(group) for key, _, group in _groups(drawn)},
@@ -56,7 +56,8 @@ def render(analysis: Observations) -> str:
         word=analysis.verdict.word if isinstance(analysis, Analysis) and not analysis.run.unexplained else "unknown",
         analysis=analysis,
         run=analysis.run,
-        rows=list(_rows(analysis)),
+        rows=list(figures.items()),
+        deviation=figures["Deviation"],
         margins=list(_margins(analysis)),
         sections=list(_sections(drawn)),
         parameters=analysis.run.scenario.to_yaml(),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.metrics.bands import TOLERANCE
+from agv_analysis.metrics.deviation import Peak
 from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.run import Floats, Run
@@ -17,9 +18,9 @@ from agv_analysis.stability.analysis import Analysis, Observations
 
 TIME = "time [s]"
 
-LINE, STEP, MARKERS, BARS = "line", "step", "markers", "bars"
+LINE, STEP, MARKERS, RINGS, BARS = "line", "step", "markers", "rings", "bars"
 
-REFERENCE, DRIVEN, LOST, OTHER, LIMIT = "reference", "driven", "lost", "other", "limit"
+REFERENCE, DRIVEN, LOST, OTHER, LIMIT, PEAK = "reference", "driven", "lost", "other", "limit", "peak"
 """What a line stands for, which gives it its colour."""
 
 SMALLEST = 1e-6
@@ -63,33 +64,35 @@ class Panel:
     """What is shown at first; None: everything."""
 
 
-def time_panels(run: Run) -> tuple[Panel, ...]:
-    """Errors, speed and age of the pose over time."""
-    return distance(run), frame_errors(run), speed(run), age(run)
+def time_panels(run: Run, worst: tuple[Peak, ...] = ()) -> tuple[Panel, ...]:
+    """Errors, speed and age of the pose over time; the largest deviations are marked."""
+    return distance(run, worst), frame_errors(run), speed(run), age(run)
 
 
 def panels(analysis: Observations) -> Iterator[Panel]:
     """All panels of a run; those that need the controller's gains only where these are known."""
-    yield track(analysis.run)
-    yield from time_panels(analysis.run)
+    worst = analysis.deviation.worst
+    yield track(analysis.run, worst)
+    yield from time_panels(analysis.run, worst)
     if analysis.outages.uplink.count:
         yield outage_lengths(analysis)
     if isinstance(analysis, Analysis) and not analysis.infeasible:
         yield unit_circle(analysis)
 
 
-def track(run: Run) -> Panel:
-    """The track from above, with the places where poses were lost."""
+def track(run: Run, worst: tuple[Peak, ...] = ()) -> Panel:
+    """The track from above, with the places where poses were lost, and those of the largest deviations."""
     reference = run.reference[:, :2]
     x, y = within(run.pose[:, 0], reference[:, 0]), within(run.pose[:, 1], reference[:, 1])
     cause = np.full(len(run), "") if run.uplink is None else run.uplink.cause
     why = Slots(run.k[run.lost], cause[run.lost])
-    lines = (
-        Line("reference", reference[:, 0], reference[:, 1], REFERENCE),
-        Line("AGV", x, y, DRIVEN),
-        Line("pose lost", x[run.lost], y[run.lost], LOST, MARKERS, why),
-    )
-    return Panel("track", "Track", "x [m]", "y [m]", lines[: 3 if run.lost.any() else 2], equal=True)
+    lines = [Line("reference", reference[:, 0], reference[:, 1], REFERENCE), Line("AGV", x, y, DRIVEN)]
+    if worst:
+        rows = np.searchsorted(run.time, [run.time[0] + peak.seconds for peak in worst])
+        lines.append(Line("largest deviations", x[rows], y[rows], PEAK, RINGS))
+    if run.lost.any():
+        lines.append(Line("pose lost", x[run.lost], y[run.lost], LOST, MARKERS, why))
+    return Panel("track", "Track", "x [m]", "y [m]", tuple(lines), equal=True)
 
 
 def within(values: Floats, reference: Floats) -> Floats:
@@ -99,9 +102,13 @@ def within(values: Floats, reference: Floats) -> Floats:
     return np.where(near, values, np.nan)
 
 
-def distance(run: Run) -> Panel:
-    """Distance between AGV and reference, on a logarithmic axis."""
+def distance(run: Run, worst: tuple[Peak, ...] = ()) -> Panel:
+    """Distance between AGV and reference, on a logarithmic axis, its largest peaks after settling marked."""
     e = run.reference[:, :2] - run.pose[:, :2]
+    marked: tuple[Line, ...] = ()
+    if worst:
+        at = np.array([run.time[0] + peak.seconds for peak in worst])
+        marked = (Line("largest deviations", at, np.array([peak.distance for peak in worst]), PEAK, RINGS),)
     return Panel(
         "distance",
         "Error",
@@ -111,6 +118,7 @@ def distance(run: Run) -> Panel:
             Line("distance", run.time, np.maximum(np.hypot(e[:, 0], e[:, 1]), SMALLEST), DRIVEN),
             Line("|y_r - y_c|", run.time, np.maximum(np.abs(e[:, 1]), SMALLEST), OTHER),
             _limit("1 cm", run, TOLERANCE),
+            *marked,
         ),
         log=True,
     )

@@ -17,7 +17,9 @@ from agv_analysis.report.panels import (
     LOST,
     MARKERS,
     OTHER,
+    PEAK,
     REFERENCE,
+    RINGS,
     STEP,
     Line,
     Panel,
@@ -26,7 +28,14 @@ from agv_analysis.report.panels import (
 )
 from agv_analysis.run import Floats
 
-COLOURS = {REFERENCE: "#8a8a8a", DRIVEN: "#3b8bd0", LOST: "#e0453c", OTHER: "#e39a2d", LIMIT: "#8a8a8a"}
+COLOURS = {
+    REFERENCE: "#8a8a8a",
+    DRIVEN: "#3b8bd0",
+    LOST: "#e0453c",
+    OTHER: "#e39a2d",
+    LIMIT: "#8a8a8a",
+    PEAK: "#a06cd5",
+}
 """Each is seen on white and on black."""
 
 MOST_POINTS = 20_000
@@ -93,6 +102,9 @@ def _trace(line: Line, most: int, markers: int) -> dict[str, Any]:
     if line.style == MARKERS:
         why = {} if line.slots is None else _why(line.slots)
         return {**trace, "mode": "markers", "marker": {"color": colour, "size": 4}, **why}
+    if line.style == RINGS:
+        ring = {"symbol": "circle-open", "size": 14, "color": colour, "line": {"width": 2}}
+        return {**trace, "mode": "markers", "marker": ring}
     dash = {"dash": "dash"} if line.role == LIMIT else {}
     shape = {"shape": "hv"} if line.style == STEP else {}
     return {**trace, "mode": "lines", "line": {"color": colour, "width": 1.5, **dash, **shape}}

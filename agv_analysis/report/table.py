@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+import numpy as np
+
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.metrics.convergence import Convergence
+from agv_analysis.metrics.deviation import DIVERGED, Deviation, Peak
 from agv_analysis.metrics.last_excursion import LastExcursion
 from agv_analysis.metrics.outages import loss_causes
 from agv_analysis.scenario import Scenario
@@ -95,6 +98,7 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
             f"{down.loss_rate:.2%} lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
         )
     yield from convergence_rows(analysis.convergence, ms)
+    yield from deviation_rows(analysis.deviation)
     yield "Fitted channel", _fit(analysis)
     if run.unexplained:
         yield "Stability", _NOT_JUDGED
@@ -118,10 +122,47 @@ def convergence_rows(found: Convergence, ms: float) -> Iterator[tuple[str, str]]
     seen = [f"{steps} steps ({steps * ms / 1e3:g} s) to {band}" for band, steps in bands.items() if steps is not None]
     seen += [f"not to {band}" for band, steps in bands.items() if steps is None and seen]
     yield "Settling", "; ".join(filter(None, (", ".join(seen), escape(first.reason))))
-    yield "Overshoot", "not known" if found.overshoot is None else f"{found.overshoot:.2%} of the initial error"
+    yield (
+        "Overshoot",
+        "not known"
+        if found.overshoot is None or np.isinf(found.overshoot)
+        else f"{found.overshoot:.2%} of the initial error",
+    )
     yield "Damping of the speed", found.damping or "the run cannot tell"
     yield "Last excursion above 1 cm", _excursion(found.excursion)
     yield "Error", _error(found)
+
+
+def deviation_rows(found: Deviation) -> Iterator[tuple[str, str]]:
+    """How far the AGV was from its reference, after which outages, and what the controller asked for."""
+    yield "Deviation", deviation_sizes(found)
+    if found.worst:
+        yield "Largest deviations", "; ".join(_peak(peak) for peak in found.worst)
+    if np.isfinite(found.speed):
+        yield "Speed asked for", f"at most {found.speed:.3g} m/s, turning at {found.turn_rate:.3g} rad/s"
+
+
+def deviation_sizes(found: Deviation) -> str:
+    """How large a deviation is, and of which part of the run."""
+    if found.is_diverged:
+        return metres(found.largest)
+    of = found.reason or "after the initial error has settled"
+    return f"{at_most(found.largest)}, 99 % of the time below {metres(found.p99)}, RMS {metres(found.rms)} ({of})"
+
+
+def _peak(peak: Peak) -> str:
+    cause = "no outage" if peak.outage is None else f"{peak.outage.link} outage of {peak.outage.slots} slots"
+    return f"{metres(peak.distance)} at {peak.seconds:g} s ({cause})"
+
+
+def at_most(value: float) -> str:
+    """A largest distance [m], as `metres`."""
+    return f"at most {metres(value)}" if value <= DIVERGED else metres(value)
+
+
+def metres(value: float) -> str:
+    """A distance [m] in three digits; of one that no track is long enough for only that the AGV diverges."""
+    return f"{value:.3g} m" if value <= DIVERGED else "diverges"
 
 
 def _excursion(found: LastExcursion | None) -> str:
@@ -135,16 +176,14 @@ def _excursion(found: LastExcursion | None) -> str:
 
 
 def _error(found: Convergence) -> str:
-    """The error at the start apart from the largest one afterwards."""
-    said = [f"{found.position.initial:.3g} m at the start"]
-    later = found.max_error_after_settling
-    if later is None or (found.position.peak > later and found.position.peak > found.position.initial):
-        said.append(f"at most {found.position.peak:.3g} m")
-    if later is not None and found.initial.has_nothing_to_settle:
-        said.append(f"at most {later:.3g} m")
-    elif later is not None:
-        said.append(f"at most {later:.3g} m after settling")
-    return ", ".join([*said, f"{found.position.final:.3g} m at the end"])
+    """The error at the start and at the end, and the largest one where that is neither."""
+    initial, peak, final = found.position.initial, found.position.peak, found.position.final
+    if not peak <= DIVERGED:
+        return f"{metres(initial)} at the start, then diverges"
+    said = [f"{metres(initial)} at the start"]
+    if peak > max(initial, final):
+        said.append(f"at most {metres(peak)}")
+    return ", ".join([*said, f"{metres(final)} at the end"])
 
 
 def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:

@@ -107,6 +107,12 @@ class Vehicle:
     settle_1cm_steps: int | None = None
     final_error: float | None = None
     """[m]"""
+    deviation_max: float | None = None
+    """Largest distance to its reference after its initial error has settled [m]."""
+    deviation_p99: float | None = None
+    deviation_rms: float | None = None
+    speed_max: float | None = None
+    """Largest |v| that its controller asked for [m/s]."""
     verdict: str | None = None
     verdict_criterion: str | None = None
     verdict_reason: str | None = None
@@ -132,6 +138,10 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
         longest_outage=found.outages.uplink.longest,
         settle_1cm_steps=figures["settle_1cm_steps"],
         final_error=figures["final_error"],
+        deviation_max=figures["deviation"]["max"],
+        deviation_p99=figures["deviation"]["p99"],
+        deviation_rms=figures["deviation"]["rms"],
+        speed_max=figures["speed"]["max"],
         verdict=figures["verdict"],
         verdict_criterion=figures["verdict_criterion"],
         verdict_reason=figures["verdict_reason"],

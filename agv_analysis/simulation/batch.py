@@ -158,35 +158,39 @@ class _Batch:
                 yield job, *self._over_links(reference, job, realisations, parts)[:2], math.nan
         for one, other in zip_longest(direct[::2], direct[1::2]):
             pair = [one] if other is None else [one, other]
-            inputs = [self._inputs(job, realisations) for job in pair]
+            inputs, decays = zip(*(self._with_decay(reference, job, realisations, parts) for job in pair), strict=True)
             found = (
                 [run_parts(statistics, parts, reference, *inputs)]
                 if other is None
                 else run_parts(statistics_of_two, parts, reference, *inputs)
             )
-            for job, its, metrics in zip(pair, inputs, found, strict=True):
-                yield job, metrics, self._decay(reference, job, its, parts), math.nan
+            for job, metrics, of_start in zip(pair, found, decays, strict=True):
+                yield job, metrics, of_start, math.nan
 
     def _with_twins(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
     ) -> Iterator[Result]:
         for job in jobs:
             twin = start_of(self._scenarios[job[0]], TWIN_OFFSET)
-            inputs = self._inputs(job, realisations)
             if self._is_direct(job):
+                inputs, of_start = self._with_decay(reference, job, realisations, parts)
                 found, contraction = run_parts(statistics_of_twins, parts, reference, inputs, twin)
-                yield job, found, self._decay(reference, job, inputs, parts), contraction
+                yield job, found, of_start, contraction
             else:
+                inputs = self._inputs(job, realisations)
                 found, of_start, traces = self._over_links(reference, job, realisations, parts)
                 is_whole = found.steps == self._steps[job[0]]
                 arguments = reference, inputs, twin, *traces
                 apart = run_parts(contraction_over_links, parts, *arguments) if is_whole else math.inf
                 yield job, found, of_start, apart
 
-    def _decay(self, reference: Floats, job: Job, inputs: RunInputs, parts: Replacements) -> Decay:
-        """What becomes of the initial error of a run whose messages arrive at once or not at all."""
+    def _with_decay(
+        self, reference: Floats, job: Job, realisations: Realisations, parts: Replacements
+    ) -> tuple[RunInputs, Decay]:
+        """A run whose messages arrive at once or not at all, and what becomes of its initial error."""
+        inputs = self._inputs(job, realisations)
         found: Decay = run_parts(decay, parts, reference, inputs, self._on_reference(job[0]))
-        return found
+        return inputs._replace(settled=max(0, found.settle_1cm_steps)), found
 
     def _start_on_reference(self, row: int) -> Loop:
         """The loop before slot 0 with the AGV on its reference."""
@@ -204,11 +208,14 @@ class _Batch:
         realisation, inputs = self._realisation(job, realisations), self._inputs(job, realisations)
         relay, steps = self._scenarios[job[0]].relay, self._steps[job[0]]
         links = realisation.link_inputs(relay.uplink, "uplink"), realisation.link_inputs(relay.downlink, "downlink")
-        up, down = empty_trace(steps), empty_trace(steps)
-        found = run_parts(statistics_over_links, parts, reference, inputs, *links, up, down)
+        up, down, squares = empty_trace(steps), empty_trace(steps), np.zeros(steps)
+        found = run_parts(statistics_over_links, parts, reference, inputs, *links, up, down, squares)
         held = [numbers(trace.held[: found.steps]) for trace in (up, down)]
         of_start = run_parts(decay_over_links, parts, reference, inputs, self._on_reference(job[0]), *held)
-        return found, of_start, (up, down)
+        settled = squares[max(0, of_start.settle_1cm_steps) : found.steps]
+        with np.errstate(over="ignore"):
+            largest, rms = math.sqrt(settled.max(initial=0.0)), math.sqrt(np.mean(settled)) if len(settled) else 0.0
+        return found._replace(deviation_max=largest, deviation_rms=rms), of_start, (up, down)
 
     def _realisation(self, job: Job, realisations: Realisations) -> ChannelRealisation:
         row, column = job

@@ -246,19 +246,24 @@ def history_over_links(
 
 
 def statistics_over_links(
-    reference: Rows, inputs: RunInputs, up: LinkInputs, down: LinkInputs, up_trace: LinkTrace, down_trace: LinkTrace
-) -> RunMetrics:
-    """One run of which only the metrics are kept, and the traces of its links."""
+    reference: Rows, inputs: RunInputs, up: LinkInputs, down: LinkInputs, up_trace: LinkTrace, down_trace: LinkTrace,
+    squares: NDArray[np.float64],
+) -> RunMetrics:  # fmt: skip
+    """One run of which only the metrics are kept, the traces of its links, and its squared distances [m^2], shape (N,).
+
+    When its initial error has settled follows from the traces, and so is not known before it has ended.
+    """
     run, past = begin(inputs), nothing_past(len(up_trace.held), inputs.start.edge.memory)
     for k in range(len(up_trace.held)):
         send_pose(past, k, run.loop, inputs.noise, inputs.settings)
         taken = transmit(up, up_trace, k, past.values[k, 0], past.values[k, 1])
         ordered = transmit(down, down_trace, k, past.values[k, 0], past.values[k, 1])
         loop, sent = slot_over_links(run.loop, k, taken, ordered, reference, inputs, past)
-        run = update_metrics(run, k, reference_at(reference, k), loop, sent)
+        run = update_metrics(run, k, reference_at(reference, k), loop, sent, 0)
+        squares[k] = run.square
         if not run.goes_on:
             break
-    return end(run, inputs.settings.ts)
+    return end(run, inputs)
 
 
 def contraction_over_links(

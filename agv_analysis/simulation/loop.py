@@ -130,6 +130,8 @@ class RunInputs(NamedTuple):
     """Normal numbers of its slots for the measured pose, shape (N, 4); None if there is no noise."""
     slip: Rows | None = None
     """The same for the wheels."""
+    settled: int = 0
+    """Step from which on the metrics of its deviation count: that at which its initial error has settled."""
 
 
 def at_rest(x: float, y: float, theta: float, states: Numbers = (), memory: Numbers = ()) -> Loop:
@@ -330,6 +332,12 @@ class RunMetrics(NamedTuple):
     position_peak: float
     """Largest distance between AGV and reference [m]; inf where its square is."""
     position_final: float
+    deviation_max: float
+    """The same from step `RunInputs.settled` on; 0 of a run that ended before."""
+    deviation_rms: float
+    """Its root mean square [m]."""
+    speed_max: float
+    """Largest |v| that the controller asked for [m/s]."""
     n_ul_max: int
     n_ul_mean: float
 
@@ -347,13 +355,17 @@ class MetricsAccumulator(NamedTuple):
     square: float
     """Distance between AGV and reference, squared [m^2]."""
     farthest: float
+    farthest_settled: float
+    """The largest since the initial error has settled [m^2]."""
+    square_sum: float
+    fastest: float
     n_ul_max: int
     n_ul_sum: int
 
 
 def begin(inputs: RunInputs) -> MetricsAccumulator:
     """A run before slot 0."""
-    return MetricsAccumulator(inputs.start, True, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
+    return MetricsAccumulator(inputs.start, True, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0)
 
 
 def proceed(
@@ -361,15 +373,16 @@ def proceed(
 ) -> MetricsAccumulator:
     """The run after slot k, at which the reference is at `now`, and the edge compares with `compared`."""
     loop, sent = slot(run.loop, compared, inputs, k)
-    return update_metrics(run, k, now, loop, sent)
+    return update_metrics(run, k, now, loop, sent, inputs.settled)
 
 
 def update_metrics(
-    run: MetricsAccumulator, k: int, now: ReferencePoint, loop: Loop, sent: EdgeOutput
+    run: MetricsAccumulator, k: int, now: ReferencePoint, loop: Loop, sent: EdgeOutput, settled: int
 ) -> MetricsAccumulator:
-    """The run after slot k, from the loop after it and what the edge sent."""
+    """The run after slot k, from the loop after it and what the edge sent; `settled` as in `RunInputs`."""
     dx, e = now.x - run.loop.motion.x, now.y - run.loop.motion.y
     size, square = abs(e), dx * dx + e * e
+    since_settled = square if k >= settled else 0.0
     return MetricsAccumulator(
         loop,
         goes_on(loop, sent),
@@ -380,16 +393,21 @@ def update_metrics(
         run.ise + e * e,
         square,
         max(run.farthest, square),
+        max(run.farthest_settled, since_settled),
+        run.square_sum + since_settled,
+        max(run.fastest, abs(sent.v)),
         max(run.n_ul_max, loop.edge.n_ul),
         run.n_ul_sum + loop.edge.n_ul,
     )
 
 
-def end(run: MetricsAccumulator, ts: float) -> RunMetrics:
+def end(run: MetricsAccumulator, inputs: RunInputs) -> RunMetrics:
     """The metrics of a run of at least one slot."""
+    ts, steps_settled = inputs.settings.ts, max(1, run.steps - inputs.settled)
     return RunMetrics(
         run.steps, run.iae * ts, run.ise * ts, run.peak, run.e, math.sqrt(run.farthest), math.sqrt(run.square),
-        run.n_ul_max, run.n_ul_sum / run.steps,
+        math.sqrt(run.farthest_settled), math.sqrt(run.square_sum / steps_settled), run.fastest, run.n_ul_max,
+        run.n_ul_sum / run.steps,
     )  # fmt: skip
 
 
@@ -401,7 +419,7 @@ def statistics(reference: Rows, inputs: RunInputs) -> RunMetrics:
         run = proceed(run, k, now, compared_reference(now, reference, k, inputs.settings.ahead), inputs)
         if not run.goes_on:
             break
-    return end(run, inputs.settings.ts)
+    return end(run, inputs)
 
 
 def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[RunMetrics, RunMetrics]:
@@ -416,7 +434,7 @@ def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tupl
             first = proceed(first, k, now, compared_reference(now, reference, k, one.settings.ahead), one)
         if second.goes_on:
             second = proceed(second, k, now, compared_reference(now, reference, k, other.settings.ahead), other)
-    return end(first, one.settings.ts), end(second, other.settings.ts)
+    return end(first, one), end(second, other)
 
 
 def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple[RunMetrics, float]:
@@ -435,7 +453,7 @@ def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple
             ends = not goes_on(twin, sent)
         if not run.goes_on:
             break
-    found = end(run, inputs.settings.ts)
+    found = end(run, inputs)
     if ends or not run.goes_on:
         return found, math.inf
     return found, pose_distance(run.loop.motion, twin.motion) / pose_distance(inputs.start.motion, begun.motion)

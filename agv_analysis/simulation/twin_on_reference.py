@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -49,6 +50,15 @@ def twin_on_reference(run: Run) -> Twin | str:
         return Twin(*_driven(run, start_of(run.scenario, at=Pose(*run.reference[0, :3].tolist()))))
     except UserError as error:
         return str(error)
+
+
+def poses_without_losses(run: Run) -> Floats:
+    """Where the AGV of a run that has a twin is, from the same start, if each message arrives in its slot; (N, 3)."""
+    fresh = np.zeros_like(run.n_ul)
+    received = np.zeros_like(run.lost)
+    return _driven(replace(run, lost=received, downlink_lost=received, n_ul=fresh, n_dl=fresh), start_of(run.scenario))[
+        0
+    ]
 
 
 def _driven(run: Run, start: Loop) -> tuple[Floats, Floats]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.metrics.convergence import Convergence, convergence
+from agv_analysis.metrics.deviation import Deviation, deviation
 from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Run
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts
@@ -38,6 +39,7 @@ class Observations:
     run: Run
     outages: Outages
     convergence: Convergence
+    deviation: Deviation
     fit: ChannelFit
     """The uplink as fitted to the run."""
 
@@ -72,6 +74,7 @@ class Observations:
             "downlink_loss_rate": down.loss_rate,
             "downlink_loss_causes": loss_causes(run.downlink),
             **self.convergence.to_json(),
+            **self.deviation.to_json(),
             "channel_fit": _fit_to_json(self.fit),
             **dict.fromkeys(_OF_GAINS),
             "no_verdict_because": None if run.gains_known else GAINS_UNKNOWN,
@@ -203,20 +206,22 @@ def _finite(value: float) -> float | None:
 
 def observe(run: Run) -> Observations:
     """What can be seen in a run, be its gains known or not. Raises UserError if the run has no step."""
-    return Observations(run=run, outages=outages(run), convergence=convergence(run), fit=fit_channel(run.lost, run.k))
+    seen, converged = outages(run), convergence(run)
+    return Observations(run, seen, converged, deviation(run, converged.initial), fit_channel(run.lost, run.k))
 
 
 def analyse(run: Run) -> Analysis:
     """Analysis of a run, recorded or simulated. Raises UserError if the run has no step or its gains are unknown."""
     if not run.gains_known:
         raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
-    facts = RunFacts(run)
+    facts, converged = RunFacts(run), convergence(run)
     judgements = judgements_of(facts)
     evidence = evidence_of_run(facts, judgements)
     return Analysis(
         run=run,
         outages=facts.outages,
-        convergence=convergence(run),
+        convergence=converged,
+        deviation=deviation(run, converged.initial),
         fit=facts.fit,
         judgements=judgements,
         verdict=verdict_of_run(facts, evidence),

@@ -377,8 +377,9 @@ def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     page.click("preset-predicted")
     page.until(lambda: "predicted: with an exact model" in page.text("summary"))
     errors = page.text("summary").splitlines()[0]
-    now, pinned = errors.removeprefix("Error in the last tenth at most ").split(" m at most ")
-    assert float(now) < 1e-6 < 1e3 < float(pinned.removesuffix(" m"))
+    now, _, pinned = errors.removeprefix("Error in the last tenth at most ").partition(" m ")
+    assert float(now) < 1e-6
+    assert pinned == "diverges" or float(pinned.removeprefix("at most ").removesuffix(" m")) > 1e3
     assert page.names("time").count("pinned") == 3
     page.click("unpin")
     page.until(lambda: "pinned" not in page.names("time"))

@@ -84,12 +84,20 @@ def shown(chromium: Chrome, page: Path) -> Chrome:
 def test_all_plots_are_drawn_and_the_console_is_silent(shown: Chrome, lap: Analysis) -> None:
     assert complaints(shown) == []
     assert shown.find_element("id", "verdict").text == sentence(lap)
-    assert of_plot(shown, "time", "plot.data.length") == 3 + 3 + 2 + 1
+    assert of_plot(shown, "time", "plot.data.length") == 4 + 3 + 2 + 1
     assert of_plot(shown, "time", "plot._fullData[0].y.length") == len(lap.run)
     for key in ("track", "time", "outages", "eigenvalues"):
         assert of_plot(shown, key, "plot.querySelectorAll('.main-svg').length") > 0
         assert of_plot(shown, key, "plot.getBoundingClientRect().height") > 300
     assert "mean-square (by mean_square)" in shown.find_element("id", "figures").text
+    # Where it strays most is marked on the track and over time, and stands in a table.
+    worst = [peak.distance for peak in lap.deviation.worst]
+    for key in ("track", "time"):
+        rings = of_plot(shown, key, "Array.from(plot._fullData.find(trace => trace.name == 'largest deviations').y)")
+        assert len(rings) == len(worst)
+    np.testing.assert_allclose(rings, worst, rtol=1e-6)
+    assert f"at most {worst[0]:.3g} m" in shown.find_element("id", "deviation").text
+    assert len(shown.find_elements("css selector", "#deviations tr")) == 1 + len(worst)
 
 
 def test_the_numbers_in_the_page_are_those_of_the_run(shown: Chrome, lap: Analysis) -> None:
