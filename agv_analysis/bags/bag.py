@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.findings import Findings
-from agv_analysis.bags.message_batch import Batch
+from agv_analysis.bags.known_types import Definition, KnownTypes
+from agv_analysis.bags.message_batch import NO_DEFINITION, Batch
+from agv_analysis.bags.message_compression import inflated_batches
 from agv_analysis.bags.message_table import Table
-from agv_analysis.bags.records import TYPE_HASH, Channel, Schema
+from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
-from agv_analysis.bags.schema import parse_schema
+from agv_analysis.bags.schema import Struct, parse_schema, short_name
 from agv_analysis.bags.storage import LARGE, Storage
 from agv_analysis.bags.type_hash import contradicts
 
@@ -57,7 +59,7 @@ class Bag:
     topics: dict[str, Topic]
     """All topics of the bag, including those that were not requested."""
     metadata: dict[str, dict[str, str]]
-    """MCAP's Metadata records by name."""
+    """MCAP's Metadata records by name; of several with one name the last."""
     problems: tuple[str, ...]
     """Everything that was lost, could not be checked, or is not as it should be; in words, with counts."""
     is_complete: bool
@@ -89,40 +91,52 @@ class Bag:
         return [
             payload
             for storage in open_files(locate(self.path))
-            for _, batch in storage.batches(lambda channel: channel.topic == topic)
+            for _, batch in inflated_batches(storage, lambda channel: channel.topic == topic, Findings())
             for payload in batch.payloads()
         ]
 
 
-def read_bag(path: Path | str, topics: Collection[str] | None = None, progress: Progress | None = None) -> Bag:
+def read_bag(
+    path: Path | str,
+    topics: Collection[str] | None = None,
+    progress: Progress | None = None,
+    definitions: Path | str | None = None,
+) -> Bag:
     """Read a rosbag2 directory, split or not, with metadata.yaml or without, or a bare .mcap or .db3 file.
 
     `topics`: those that are wanted as arrays, None for all; an empty collection reads what the bag holds and checks it.
+    `definitions`: a folder with .msg, .idl or .srv files of types that the bag does not define.
     Whatever is wrong with the bag is in its `problems`. Raises BagError if there is no bag at `path`, or one of which
     nothing can be read.
     """
     path = Path(path)
     contents = locate(path)
+    types = KnownTypes(None if definitions is None else Path(definitions))
     with ThreadPoolExecutor(1, "pages") as helper:
-        reading = _Reading(topics, helper)
+        reading = _Reading(topics, helper, contents, types)
         for number, storage in enumerate(open_files(contents)):
-            for channel, batch in storage.batches(reading.is_wanted):
+            for channel, batch in inflated_batches(storage, reading.is_wanted, contents.findings):
                 reading.take(storage, channel, batch)
                 if progress is not None:
                     share = storage.position / max(1, storage.size)
                     progress(int(100 * (number + share) / len(contents.files)))
             reading.finish(storage)
-        return reading.bag(path, contents)
+        return reading.bag(path)
 
 
 class _Reading:
     """What has been read so far, over all files of a bag."""
 
-    def __init__(self, topics: Collection[str] | None, helper: Executor) -> None:
+    def __init__(self, topics: Collection[str] | None, helper: Executor, contents: Contents, types: KnownTypes) -> None:
         self._helper = helper
+        self._contents = contents
+        self._types = types
         self._wanted = None if topics is None else frozenset(topics)
         self._findings = Findings()
         self._known: dict[str, tuple[Channel, Schema | None]] = {}
+        self._borrowed: dict[str, str] = {}
+        self._first: dict[str, Schema] = {}
+        self._forms: dict[tuple[str, str, bytes], Struct] = {}
         self._tables: dict[str, Table] = {}
         self._refusals: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
@@ -138,7 +152,7 @@ class _Reading:
         schema = storage.schemas.get(channel.schema_id)
         latest = self._latest.get(channel.id)
         if latest is None or latest[0] is not channel or latest[1] is not schema:
-            latest = self._latest[channel.id] = channel, schema, self._table(storage, channel)
+            latest = self._latest[channel.id] = channel, schema, self._table(storage, channel, batch)
         table = latest[2]
         if table is None:
             return
@@ -153,44 +167,71 @@ class _Reading:
             self._counts[channel.topic] += storage.counts[number]
             self._known.setdefault(channel.topic, (channel, storage.schemas.get(channel.schema_id)))
             if self.is_wanted(channel):
-                self._table(storage, channel)
+                self._table(storage, channel, None)
         self._metadata.update(storage.metadata)
         self._findings.merge(storage.findings)
 
-    def _table(self, storage: Storage, channel: Channel) -> Table | None:
-        """The table of a channel's topic, None if its messages cannot be decoded."""
-        topic, schema = channel.topic, storage.schemas.get(channel.schema_id)
-        _, first = self._known.setdefault(topic, (channel, schema))
-        if topic in self._refusals:
-            return None
+    def _table(self, storage: Storage, channel: Channel, batch: Batch | None) -> Table | None:
+        """The table of a channel's topic, None if its messages cannot be decoded; `batch`: some of them."""
+        topic = channel.topic
+        schema = storage.schemas.get(channel.schema_id) or self._by_metadata(topic)
+        self._known.setdefault(topic, (channel, schema))
+        if topic in self._refusals or (batch is None and topic in self._tables):
+            return self._tables.get(topic)
         try:
             if channel.encoding != "cdr":
                 raise UndecodableError(f"its messages are encoded as {channel.encoding!r}; only cdr is read")
-            if schema is None or first is None:
-                raise UndecodableError("the bag does not hold the definition of its type")
-            if (schema.name, schema.encoding, schema.text) != (first.name, first.encoding, first.text):
+            if schema is None:
+                raise UndecodableError(NO_DEFINITION)
+            definition = self._define(storage, channel, schema, batch)
+            form = self._form(definition.schema)
+            first = self._first.setdefault(topic, definition.schema)
+            if short_name(first.name) != short_name(schema.name) or self._form(first) != form:
                 raise UndecodableError(f"it has messages of two types, {first.name} and {schema.name}")
             if topic not in self._tables:
-                kind = parse_schema(schema.name, schema.encoding, schema.text)
-                if contradicts(schema.name, schema.text, channel.metadata.get(TYPE_HASH, "")):
+                self._known[topic] = channel, definition.schema
+                if contradicts(schema.name, definition.schema.text, channel.metadata.get(TYPE_HASH, "")):
                     what = "definition of its type that does not match the recorded hash, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
                 helper = self._helper if storage.size > LARGE else None
-                self._tables[topic] = Table(kind, storage.expected(channel.id), helper)
+                self._tables[topic] = Table(form, storage.expected(channel.id), helper)
         except UndecodableError as error:
             self._refuse(topic, error)
         return self._tables.get(topic)
+
+    def _by_metadata(self, topic: str) -> Schema | None:
+        """What metadata.yaml knows of a topic's type: its name."""
+        kind = self._contents.types.get(topic)
+        return Schema(0, kind, "", b"") if kind else None
+
+    def _define(self, storage: Storage, channel: Channel, schema: Schema, batch: Batch | None) -> Definition:
+        """The definition of a channel's type, from wherever there is one."""
+        message = None
+        if batch is not None and len(batch):
+            begin = int(batch.starts[0])
+            message = batch.buffer[begin : begin + int(batch.sizes[0])].tobytes()
+        distro = storage.distro or self._contents.distro
+        found = self._types.define(schema, distro, channel.metadata.get(TYPE_HASH, ""), message)
+        if found.source:
+            self._borrowed[channel.topic] = found.source
+        return found
+
+    def _form(self, schema: Schema) -> Struct:
+        key = (schema.name, schema.encoding, schema.data)
+        if key not in self._forms:
+            self._forms[key] = parse_schema(schema.name, schema.encoding, schema.text)
+        return self._forms[key]
 
     def _refuse(self, topic: str, error: UndecodableError) -> None:
         self._refusals[topic] = f"cannot be decoded: {error}"
         self._tables.pop(topic, None)
         self._latest.clear()
 
-    def bag(self, path: Path, contents: Contents) -> Bag:
+    def bag(self, path: Path) -> Bag:
         """The bag, once all files have been read."""
         arrays = {topic: table.rows for topic, table in sorted(self._tables.items())}
-        self._findings.merge(contents.findings)
-        self._compare_with_metadata(contents)
+        self._findings.merge(self._contents.findings)
+        self._compare_with_metadata()
         for topic, table in sorted(self._tables.items()):
             if table.layouts.misfits:
                 what = f"{topic}: message that is not of its type, left out ({table.layouts.first_misfit})"
@@ -199,22 +240,47 @@ class _Reading:
         with ThreadPoolExecutor(_THREADS, "bag") as pool:
             for found in pool.map(check_times, unclear, map(arrays.__getitem__, unclear)):
                 self._findings.merge(found)
+        for topic, source in sorted(self._borrowed.items()):
+            if topic in arrays:
+                self._findings.add(f"{topic}: topic whose definition is not in the bag, that of {source} used")
         for topic, reason in sorted(self._refusals.items()):
             self._findings.add(f"{topic}: topic that {reason}")
         topics = {name: self._topic(name) for name in sorted(self._known)}
         findings = self._findings
         return Bag(path, topics, self._metadata, findings.texts(), not findings.is_loss, arrays, self._refusals)
 
-    def _compare_with_metadata(self, contents: Contents) -> None:
-        for topic, expected in contents.counts.items():
-            found = self._counts[topic]
+    def _compare_with_metadata(self) -> None:
+        counts, types = self._contents.counts, self._contents.types
+        renamed = self._renamed()
+        for topic, expected in counts.items():
+            found = self._counts[renamed.get(topic, topic)]
+            if topic in renamed:
+                self._findings.add(f"{renamed[topic]}: topic that {METADATA} calls {topic}")
             if found < expected:
                 what = f"{topic}: message that {METADATA} counts and that is not there"
                 self._findings.add(what, expected - found, is_loss=True)
             elif found > expected:
                 self._findings.add(f"{topic}: message more than {METADATA} counts", found - expected)
+            _, schema = self._known.get(topic, (None, None))
+            if schema is not None and types.get(topic) and types[topic] != schema.name:
+                self._findings.add(f"{topic}: topic of type {schema.name} that {METADATA} calls {types[topic]}")
+
+    def _renamed(self) -> dict[str, str]:
+        """Topics of metadata.yaml that are not in the bag, with those of equal type and count that are not in it."""
+        counts, types = self._contents.counts, self._contents.types
+        others = {name: schema for name, (_, schema) in self._known.items() if name not in counts}
+        found: dict[str, str] = {}
+        for topic in counts.keys() - self._known.keys():
+            twins = [
+                name
+                for name, schema in others.items()
+                if self._counts[name] == counts[topic] and (schema is None or schema.name == types.get(topic))
+            ]
+            if len(twins) == 1 and twins[0] not in found.values():
+                found[topic] = twins[0]
+        return found
 
     def _topic(self, name: str) -> Topic:
         channel, schema = self._known[name]
         kind, text = (schema.name, schema.text) if schema else ("", "")
-        return Topic(name, kind, self._counts[name], text, channel.metadata.get("offered_qos_profiles", ""))
+        return Topic(name, kind, self._counts[name], text, channel.metadata.get(QOS, ""))

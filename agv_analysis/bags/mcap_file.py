@@ -13,6 +13,7 @@ Python's lock.
 
 from __future__ import annotations
 
+import re
 from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -77,7 +78,9 @@ from agv_analysis.bags.records import (
     parse_statistics,
 )
 from agv_analysis.bags.source import Record, Source
-from agv_analysis.bags.storage import LARGE, IsWanted
+from agv_analysis.bags.storage import LARGE, IsWanted, undescribed
+
+_DISTRO = re.compile(r"^ros_distro:\s*['\"]?(\w+)", re.MULTILINE)
 
 _WINDOW = 2**20
 _TOGETHER = 2**20
@@ -140,18 +143,21 @@ class _Some(NamedTuple):
 class McapFile:
     """Reads one MCAP file. Everything but the batches is complete only after these have been read."""
 
-    def __init__(self, path: Path, keep_attachments: bool = False) -> None:
-        """Open the file. Raises BagError if it cannot be read or is no MCAP file."""
+    def __init__(self, path: Path, keep_all: bool = False) -> None:
+        """Open the file. Raises BagError if it cannot be read or is no MCAP file.
+
+        `keep_all`: attachments, and the messages of channels that are not described, whose topic nobody knows.
+        """
         self.path = path
         self.findings = Findings()
-        self.metadata: dict[str, dict[str, str]] = {}
+        self.metadata: list[tuple[str, dict[str, str]]] = []
         self.attachments: list[Attachment] = []
         self.statistics: Statistics | None = None
         self.counts: Counter[int] = Counter()
         """Messages found by channel."""
         self.position = 0
         """How far the file has been read [B]."""
-        self._keep_attachments = keep_attachments
+        self._keep_all = keep_all
         self._definitions = Definitions(self.findings)
         self._is_proven = False
         self._damages = 0
@@ -173,6 +179,13 @@ class McapFile:
     def size(self) -> int:
         """Bytes of the file."""
         return self._source.size
+
+    @property
+    def distro(self) -> str:
+        """ROS distribution of the recorder, empty if the file does not say."""
+        about = next((content for name, content in self.metadata if name == "rosbag2"), {})
+        found = _DISTRO.search(about.get("serialized_metadata", ""))
+        return found[1] if found else ""
 
     def expected(self, channel: int) -> int:
         """Messages of a channel according to the file's statistics, 0 if it has none."""
@@ -312,8 +325,7 @@ class McapFile:
             if record.opcode == MESSAGE_INDEX and packed is not None:
                 packed.indexes.append(parse_index(record.content))
             elif record.opcode == METADATA:
-                name, content = parse_metadata(record.content)
-                self.metadata[name] = content
+                self.metadata.append(parse_metadata(record.content))
                 if not self._is_proven:
                     self.findings.add_unchecked("metadata records")
             elif record.opcode == ATTACHMENT:
@@ -327,7 +339,7 @@ class McapFile:
         attachment, crc = parse_attachment(record.content)
         if crc and crc32(record.content[:-4]) != crc:
             self.findings.add("attachment that does not match its CRC, left out", at=record.position, is_loss=True)
-        elif self._keep_attachments:
+        elif self._keep_all:
             self.attachments.append(attachment)
 
     def _define(self, definition: Definition, is_proven: bool) -> None:
@@ -450,9 +462,11 @@ class McapFile:
         for number, mine in messages.items():
             channel = channels.get(number)
             if channel is None:
-                what = f"message of channel {number}, which is not described, left out"
+                what = f"message of channel {number}, which is not described, so that its topic is not known"
                 self.findings.add(what, len(mine.starts), is_loss=True)
-                continue
+                if not self._keep_all:
+                    continue
+                channel = undescribed(number)
             self.counts[number] += len(mine.starts)
             if is_wanted(channel):
                 yield channel, Batch(buffer, mine.starts + lead, mine.lengths - (MESSAGE_HEAD - LEAD))

@@ -13,6 +13,8 @@ from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.layout import LEAD, Layout, trace
 from agv_analysis.bags.schema import Struct
 
+NO_DEFINITION = "the bag does not hold the definition of its type, and no ROS 2 distribution knows one"
+
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
@@ -80,7 +82,10 @@ class Layouts:
         """Why the first of them is not."""
 
     def split(self, batch: Batch) -> list[Group]:
-        """The messages of a batch by layout; those that are not of the topic's type are counted as misfits."""
+        """The messages of a batch by layout; those that are not of the topic's type are counted as misfits.
+
+        Raises UndecodableError if the type has no values and a message has: its definition was not recorded then.
+        """
         sizes = batch.sizes
         if not len(batch):
             return []
@@ -115,6 +120,8 @@ class Layouts:
         try:
             layout = trace(self._kind, message)
         except UndecodableError as error:
+            if self._kind.is_empty:
+                raise UndecodableError(NO_DEFINITION) from None
             self.first_misfit = self.first_misfit or str(error)
             self.misfits += 1
             return None

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from agv_ros.errors import UserError
@@ -15,6 +16,8 @@ _PRIMITIVES = {
     "uint64", "string", "wstring",
 }  # fmt: skip
 
+_NAME = re.compile(r"(?P<package>[A-Za-z]\w*)/(?:(?P<part>msg|srv)/)?(?P<kind>[A-Za-z]\w*)", re.ASCII)
+
 _SEPARATOR = "\n" + "=" * 80 + "\n"
 
 
@@ -23,14 +26,19 @@ def schema_of(type_name: str) -> str:
 
     Raises UserError if a package that the type needs is not installed.
     """
+    return assemble(type_name, installed_definition)
+
+
+def assemble(type_name: str, definition: Callable[[str], str]) -> str:
+    """Definition of a type, those of the types in it appended; `definition` gives each alone, by its short name."""
     root = _short(type_name)
-    found = {root: _definition(root)}
+    found = {root: definition(root)}
     waiting = [root]
     while waiting:
         name = waiting.pop(0)
         for inner in _types_in(name, found[name]):
             if inner not in found:
-                found[inner] = _definition(inner)
+                found[inner] = definition(inner)
                 waiting.append(inner)
     text = found.pop(root)
     return text + "".join(f"{_SEPARATOR}MSG: {name}\n{inner}" for name, inner in found.items())
@@ -49,13 +57,25 @@ def _types_in(name: str, text: str) -> Iterator[str]:
             continue
         kind = words[0].split("[")[0].split("<")[0]
         if kind not in _PRIMITIVES:
-            yield _short(kind) if "/" in kind else f"{name.split('/')[0]}/{kind}"
+            yield _short(kind) if "/" in kind else _sibling(name, kind)
 
 
-def _definition(name: str) -> str:
-    package, _, kind = name.partition("/")
+def _sibling(name: str, kind: str) -> str:
+    """A message type that a definition of the type `name` names without its package."""
+    return "std_msgs/Header" if kind == "Header" else f"{name.split('/')[0]}/{kind}"
+
+
+def installed_definition(name: str) -> str:
+    """Definition of a message (`geometry_msgs/Pose`) or service (`std_srvs/srv/Trigger`) by its installed package.
+
+    Raises UserError if the package is not installed.
+    """
+    found = _NAME.fullmatch(name)
+    if found is None:
+        raise UserError(f"{name!r} is no name of a message type, such as geometry_msgs/msg/PoseStamped")
+    package, part, kind = found["package"], found["part"], found["kind"]
     for share in _share_folders(package):
-        path = share / package / "msg" / f"{kind}.msg"
+        path = share / package / (part or "msg") / f"{kind}.{part or 'msg'}"
         if path.is_file():
             return path.read_text(encoding="utf-8")
     raise UserError(f"no definition of the message type {name} found: is the package {package} installed?")
@@ -63,11 +83,8 @@ def _definition(name: str) -> str:
 
 def _share_folders(package: str) -> Iterator[Path]:
     """Where a package's share folder may be: beside its Python module, as ROS and pip both lay it, or as ament says."""
-    try:
-        origin = importlib.import_module(package).__file__
-    except ImportError:
-        origin = None
-    if origin is not None:
-        yield Path(origin).parents[4] / "share"
+    found = importlib.util.find_spec(package)  # without importing it: the name may come from a bag
+    if found is not None and found.origin and len(Path(found.origin).parents) > 4:
+        yield Path(found.origin).parents[4] / "share"
     for prefix in (*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix):
         yield Path(prefix) / "share"

@@ -16,7 +16,7 @@ from agv_analysis.bags.compiled_decoder import MAX_LAYOUTS, Run, compiled_place,
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
 from agv_analysis.bags.message_batch import Batch, Bytes, Group, Ints, Layouts, values_at
 from agv_analysis.bags.prefault import Prefault
-from agv_analysis.bags.schema import STRING, Struct
+from agv_analysis.bags.schema import PLACEHOLDER, STRING, Struct
 
 _MISFITS_BELIEVED = 100
 """After this many messages, none of which is of its type, the definition is not theirs."""
@@ -71,7 +71,7 @@ def _columns(kind: Struct, prefix: str = "", dims: tuple[int, ...] = ()) -> Iter
             inner = (*dims, member.length)
         if isinstance(member.element, Struct):
             yield from _columns(member.element, f"{path}.", inner)
-        elif not path.endswith("structure_needs_at_least_one_member"):
+        elif not path.endswith(PLACEHOLDER):
             yield path, _Column("S" if member.element == STRING else member.element, list(inner))
 
 

@@ -33,6 +33,9 @@ DATA_END_SIZE = RECORD.size + 4
 TYPE_HASH = "topic_type_hash"
 """Key in a channel's metadata that holds the hash of its type."""
 
+QOS = "offered_qos_profiles"
+"""Key in a channel's metadata that holds the QoS of its publishers (YAML)."""
+
 Read = Callable[[int, int], bytes]
 """Bytes from a place (first argument), as many as the second one says, or fewer at the end."""
 
@@ -116,7 +119,17 @@ class Schema:
     id: int
     name: str
     encoding: str
-    text: str
+    data: bytes
+    """As it lies in the bag; some languages are not text."""
+
+    def defined_by(self, encoding: str, data: bytes) -> Schema:
+        """The same type with another definition."""
+        return Schema(self.id, self.name, encoding, data)
+
+    @property
+    def text(self) -> str:
+        """The definition to read; what is not UTF-8, as in comments written long ago, is replaced."""
+        return self.data.decode("utf-8", "replace")
 
 
 @dataclass(frozen=True)
@@ -176,7 +189,7 @@ class Attachment(NamedTuple):
 def parse_schema(content: bytes) -> Schema:
     """Schema record. Raises DamagedError."""
     cursor = Cursor(content)
-    return Schema(cursor.number(2), cursor.text(), cursor.text(), cursor.text())
+    return Schema(cursor.number(2), cursor.text(), cursor.text(), cursor.block())
 
 
 def parse_channel(content: bytes) -> Channel:

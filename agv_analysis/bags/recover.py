@@ -1,31 +1,35 @@
-"""A damaged bag -> a clean one with every complete message."""
+"""A damaged bag -> a sound one with every complete message.
+
+A message is copied whether or not its definition is known and describes it: the definition may be what is wrong.
+"""
 
 from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import yaml
 from mcap.writer import CompressionType, Writer
 
 from agv_analysis.bags.bag import Progress
 from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.findings import Findings
-from agv_analysis.bags.message_batch import Batch, Layouts
-from agv_analysis.bags.records import TYPE_HASH, Channel
-from agv_analysis.bags.rosbag2 import METADATA, locate, open_files
+from agv_analysis.bags.known_types import Definition, KnownTypes
+from agv_analysis.bags.message_batch import NO_DEFINITION, Batch, Layouts
+from agv_analysis.bags.message_compression import inflated_batches
+from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
+from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
 from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import Storage
 from agv_analysis.bags.writer import TopicInfo, metadata_text, rosbag2_metadata
 
 
 class Recovery(NamedTuple):
-    """What a clean bag holds, and what the damaged one no longer did."""
+    """What the new bag holds, and what the damaged one no longer did."""
 
     counts: dict[str, int]
     """Messages by topic."""
@@ -34,13 +38,15 @@ class Recovery(NamedTuple):
     """Is nothing known to be missing?"""
 
 
-def recover(path: Path, out: Path, progress: Progress | None = None) -> Recovery:
+def recover(path: Path, out: Path, progress: Progress | None = None, definitions: Path | None = None) -> Recovery:
     """Write every whole message of a bag, as it was sent, to a new one, in file order, with all checksums and indexes.
 
     `out` becomes an MCAP file if its name ends in .mcap, else a rosbag2 directory. Of a message's record only the
-    sequence number is not kept. Raises BagError if nothing can be read, or if `out` exists or cannot be written.
+    sequence number is not kept. A definition that the bag lacks is added from `definitions`, a folder, or from a ROS 2
+    distribution, if that is known to describe the messages. Raises BagError if nothing can be read, or if `out` exists
+    or cannot be written.
     """
-    contents = locate(path)
+    contents, types = locate(path), KnownTypes(definitions)
     is_file = out.suffix == ".mcap"
     writing = out.with_name(out.name + ".part")
     if out.exists() or writing.exists():
@@ -51,8 +57,8 @@ def recover(path: Path, out: Path, progress: Progress | None = None) -> Recovery
             writing.mkdir()
         target = writing if is_file else writing / f"{out.name}_0.mcap"
         try:
-            copy = _Copy(target)
-            for number, storage in enumerate(open_files(contents, keep_attachments=True)):
+            copy = _Copy(target, contents, types)
+            for number, storage in enumerate(open_files(contents, keep_all=True)):
                 for share in copy.add(storage):
                     if progress is not None:
                         progress(int(100 * (number + share) / len(contents.files)))
@@ -67,17 +73,62 @@ def recover(path: Path, out: Path, progress: Progress | None = None) -> Recovery
     return Recovery(dict(sorted(copy.counts.items())), copy.findings.texts(), not copy.findings.is_loss)
 
 
-class _Copy:
-    """A clean MCAP file in the course of being written."""
+class _Checked:
+    """Messages of one topic and definition, and how many of them the definition does not describe."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, channel: Channel, schema: Schema | None, define: Callable[[Schema], Definition]) -> None:
+        """`schema` is what the bag says of the type, `define` gives its definition, from wherever there is one."""
+        self._layouts: Layouts | None = None
+        self.schema = schema
+        """With a definition from elsewhere if the bag has none and that describes the first message."""
+        self._source = ""
+        self._reason = ""
+        """Why messages cannot be held against the definition, if so."""
+        self._count = 0
+        try:
+            if channel.encoding != "cdr":
+                raise UndecodableError(f"they are encoded as {channel.encoding!r}")
+            if schema is None:
+                raise UndecodableError(NO_DEFINITION)
+            self.schema, self._source = define(schema)
+            self._layouts = Layouts(parse_schema(self.schema.name, self.schema.encoding, self.schema.text))
+        except UndecodableError as error:
+            self._reason = str(error)
+
+    def take(self, batch: Batch) -> None:
+        """Hold messages against the definition."""
+        self._count += len(batch)
+        try:
+            if self._layouts is not None:
+                self._layouts.split(batch)
+        except UndecodableError as error:
+            self._layouts, self._reason = None, str(error)
+
+    def report(self, topic: str, findings: Findings) -> None:
+        """Say which messages were copied although nothing describes them."""
+        if self._source:
+            findings.add(f"{topic}: topic whose definition is not in the bag, that of {self._source} written")
+        if self._reason and self._count:
+            findings.add(f"{topic}: message copied as it is, unchecked ({self._reason})", self._count)
+        elif self._layouts is not None and self._layouts.misfits:
+            is_damage = self._layouts.misfits < self._count  # else it is the definition that is wrong
+            what = f"{topic}: message that its definition does not describe, copied as it is"
+            findings.add(f"{what} ({self._layouts.first_misfit})", self._layouts.misfits, is_loss=is_damage)
+
+
+class _Copy:
+    """A new MCAP file in the course of being written."""
+
+    def __init__(self, path: Path, contents: Contents, types: KnownTypes) -> None:
         self.path = path
+        self._contents = contents
+        self._types = types
         self.findings = Findings()
         self.counts: Counter[str] = Counter()
-        self._schemas: dict[tuple[str, str, str], int] = {}
-        self._channels: dict[tuple[str, str, int], int] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[tuple[Any, ...], int] = {}
         self._topics: dict[str, TopicInfo] = {}
-        self._layouts: dict[tuple[str, int], Layouts | None] = {}
+        self._checked: dict[tuple[str, str, int], _Checked] = {}
         self._first_ns, self._last_ns = 2**63 - 1, 0
         self._file = path.open("xb")
         self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
@@ -85,10 +136,10 @@ class _Copy:
 
     def add(self, storage: Storage) -> Iterator[float]:
         """Copy all that is whole in a file; yields the share that is done."""
-        batches = storage.batches(lambda channel: True)
+        batches = inflated_batches(storage, lambda channel: True, self.findings)
         # The key holds on to the buffer, so that no other one can have its id.
         for _, part in groupby(batches, key=lambda found: (id(found[1].buffer), found[1].buffer)):
-            for channel, log_time, publish_time, payload in _in_file_order(self._sound(storage, part)):
+            for channel, log_time, publish_time, payload in _in_file_order(self._look(storage, part)):
                 number = self._channel(storage, channel)
                 self._writer.add_message(number, log_time, payload, publish_time)
                 self.counts[channel.topic] += 1
@@ -96,54 +147,41 @@ class _Copy:
             yield storage.position / max(1, storage.size)
         for channel in storage.channels.values():
             self._channel(storage, channel)
-        for name, content in storage.metadata.items():
+        for name, content in storage.metadata:
             if name != "rosbag2":  # counts the messages of the damaged bag
                 self._writer.add_metadata(name, content)
         for item in storage.attachments:
             self._writer.add_attachment(item.create_time, item.log_time, item.name, item.media_type, item.content)
         self.findings.merge(storage.findings)
 
-    def _sound(self, storage: Storage, batches: Iterator[tuple[Channel, Batch]]) -> Iterator[tuple[Channel, Batch]]:
-        """The batches without those messages that are not of their topic's type."""
+    def _look(self, storage: Storage, batches: Iterator[tuple[Channel, Batch]]) -> Iterator[tuple[Channel, Batch]]:
+        """The batches, each held against the definition of its topic."""
         for channel, batch in batches:
-            layouts = self._layouts_of(storage, channel)
-            if layouts is None:
-                yield channel, batch
-                continue
-            before = layouts.misfits
-            places = [group.places for group in layouts.split(batch)]
-            if layouts.misfits == before:
-                yield channel, batch
-                continue
-            what = f"{channel.topic}: message that is not of its type, left out ({layouts.first_misfit})"
-            self.findings.add(what, layouts.misfits - before, is_loss=True)
-            if places:
-                kept = np.sort(np.concatenate(places))
-                yield channel, Batch(batch.buffer, batch.starts[kept], batch.sizes[kept])
+            key = (str(storage.path), channel.topic, channel.id)
+            if key not in self._checked:
+                self._checked[key] = self._first(storage, channel, batch)
+            self._checked[key].take(batch)
+            yield channel, batch
 
-    def _layouts_of(self, storage: Storage, channel: Channel) -> Layouts | None:
-        """Layouts of a channel's messages, None if these cannot be decoded and thus not be checked."""
-        key = (str(storage.path), channel.id)
-        if key not in self._layouts:
-            schema = storage.schemas.get(channel.schema_id)
-            self._layouts[key] = None
-            if schema is not None and channel.encoding == "cdr":
-                try:
-                    self._layouts[key] = Layouts(parse_schema(schema.name, schema.encoding, schema.text))
-                except UndecodableError as error:
-                    self.findings.add(f"{channel.topic}: topic whose messages are copied unchecked ({error})")
-        return self._layouts[key]
+    def _first(self, storage: Storage, channel: Channel, batch: Batch) -> _Checked:
+        """What the first messages of a channel are held against."""
+        begin, kind = int(batch.starts[0]), self._contents.types.get(channel.topic)
+        message = batch.buffer[begin : begin + int(batch.sizes[0])].tobytes()
+        distro, type_hash = storage.distro or self._contents.distro, channel.metadata.get(TYPE_HASH, "")
+        schema = storage.schemas.get(channel.schema_id) or (Schema(0, kind, "", b"") if kind else None)
+        return _Checked(channel, schema, lambda schema: self._types.define(schema, distro, type_hash, message))
 
     def _channel(self, storage: Storage, channel: Channel) -> int:
         """Number of a channel in the clean file."""
-        schema = storage.schemas.get(channel.schema_id)
+        checked = self._checked.get((str(storage.path), channel.topic, channel.id))
+        schema = checked.schema if checked is not None else storage.schemas.get(channel.schema_id)
         schema_id = 0
         if schema is not None:
-            about = (schema.name, schema.encoding, schema.text)
+            about = (schema.name, schema.encoding, schema.data)
             if about not in self._schemas:
-                self._schemas[about] = self._writer.register_schema(*about[:2], about[2].encode())
+                self._schemas[about] = self._writer.register_schema(*about)
             schema_id = self._schemas[about]
-        key = (channel.topic, channel.encoding, schema_id)
+        key = (channel.topic, channel.encoding, schema_id, *sorted(channel.metadata.items()))
         if key not in self._channels:
             self._channels[key] = self._writer.register_channel(
                 channel.topic, channel.encoding, schema_id, channel.metadata
@@ -153,6 +191,8 @@ class _Copy:
 
     def close(self, metadata: Path | None) -> None:
         """Write the index and, for a directory, its metadata.yaml."""
+        for (_, topic, _), checked in self._checked.items():
+            checked.report(topic, self.findings)
         topics = [(topic, self.counts[name]) for name, topic in sorted(self._topics.items())]
         first = min(self._first_ns, self._last_ns)
         about = rosbag2_metadata(self.path.name, first, self._last_ns, topics)
@@ -179,8 +219,8 @@ def _in_file_order(batches: Iterator[tuple[Channel, Batch]]) -> Iterator[tuple[C
 
 def _topic_info(channel: Channel, kind: str) -> TopicInfo:
     try:
-        qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
+        qos = yaml.safe_load(channel.metadata.get(QOS, "")) or []
     except yaml.YAMLError:
         qos = []
     type_hash = channel.metadata.get(TYPE_HASH, "")
-    return TopicInfo(channel.topic, kind, "", type_hash, qos if isinstance(qos, list) else [])
+    return TopicInfo(channel.topic, kind, "", type_hash, qos if isinstance(qos, list) else [], channel.encoding)

@@ -1,4 +1,8 @@
-"""The files of a bag: what a rosbag2 directory holds, with metadata.yaml or without."""
+"""The files of a bag: what a rosbag2 directory holds, with metadata.yaml or without.
+
+What kind a file is its first bytes say, not its name. metadata.yaml is a hint: where it and the files differ, the files
+are right, and the difference is reported.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +11,27 @@ import re
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from agv_analysis.bags.bag_errors import BagError
+from agv_analysis.bags.compression import compression_of
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.mcap_file import McapFile
+from agv_analysis.bags.records import MAGIC as MCAP
+from agv_analysis.bags.sqlite_file import MAGIC as SQLITE
+from agv_analysis.bags.sqlite_file import SqliteFile
 from agv_analysis.bags.storage import Storage
 
 METADATA = "metadata.yaml"
 
-_PACKED = ".zstd"
-"""Ending that rosbag2 adds to the files that it compresses as a whole."""
+_PACKED = (".zstd", ".zst")
+"""Endings of files that were compressed as a whole; the first is rosbag2's."""
+
+_STORAGES = (".mcap", ".db3")
 
 _MOST_TIMES = 1000
 _ALWAYS_UNPACKED = 2**30
@@ -34,22 +45,30 @@ _MAX_METADATA = 2**26
 
 @dataclass
 class Contents:
-    """Where the messages of a bag are."""
+    """Where the messages of a bag are, and what its metadata.yaml says of them."""
 
     files: list[Path]
-    is_mcap: bool = True
-    """Else `files` is what the library rosbags is to open."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Messages by topic, as metadata.yaml has it."""
+    """Messages by topic."""
+    types: dict[str, str] = field(default_factory=dict)
+    """Types by topic."""
+    distro: str = ""
+    """ROS distribution of the recorder."""
     findings: Findings = field(default_factory=Findings)
 
 
 def locate(path: Path) -> Contents:
-    """Contents of a rosbag2 directory, or of a bare file. Raises BagError if there is no bag."""
+    """Contents of a rosbag2 directory, of a bare file, or of the bag that a file belongs to. Raises BagError."""
     if not path.exists():
         raise BagError(f"{path}: there is no such file or directory")
-    if not path.is_dir():
-        return Contents([path], is_mcap=path.suffix != ".db3")
+    if path.is_dir():
+        return _directory(path)
+    if path.name == METADATA:
+        return _directory(path.parent)
+    return _bag_of_file(path)
+
+
+def _directory(path: Path) -> Contents:
     if (path / METADATA).exists():
         return _by_metadata(path)
     contents = _by_name(path)
@@ -57,19 +76,37 @@ def locate(path: Path) -> Contents:
     return contents
 
 
-def open_files(contents: Contents, keep_attachments: bool = False) -> Iterator[Storage]:
+def _bag_of_file(path: Path) -> Contents:
+    """The bag whose metadata.yaml lists a file among others; the file alone, if there is none."""
+    if (path.parent / METADATA).exists():
+        with contextlib.suppress(BagError, KeyError, TypeError, ValueError, AttributeError):
+            listed = [Path(str(name)).name for name in _read_metadata(path.parent / METADATA)["relative_file_paths"]]
+            if path.name in listed:
+                contents = _by_metadata(path.parent)
+                if len(listed) > 1:
+                    contents.findings.add(f"{path.name} is one of {len(listed)} files of a split bag, all of them read")
+                return contents
+    contents = Contents([path])
+    parts = [file.name for file in _files_in(path.parent) if file != path and _family(file) == _family(path)]
+    if parts and _number(path) is not None:
+        contents.findings.add(f"{path.name} read alone; beside it, of the same split bag: {', '.join(parts)}")
+    return contents
+
+
+def open_files(contents: Contents, keep_all: bool = False) -> Iterator[Storage]:
     """The files of a bag, one after the other, closed as the next is asked for.
 
+    `keep_all`: with what only a copy needs, attachments and messages of channels that are not described.
     A file that is damaged beyond reading is reported, unless there is no other. Raises BagError.
     """
     for path in contents.files:
         with contextlib.ExitStack() as stack:
             try:
                 file = path
-                if path.suffix == _PACKED:
+                if compression_of(_beginning(path)) == "zstd":
                     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="agv_ncs_"))
                     file = _unpack(path, Path(folder), contents.findings)
-                storage = _open(file, contents.is_mcap, keep_attachments)
+                storage = _open(file, keep_all)
             except BagError as error:
                 if len(contents.files) == 1:
                     raise
@@ -79,11 +116,19 @@ def open_files(contents: Contents, keep_attachments: bool = False) -> Iterator[S
             yield storage
 
 
+def _beginning(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read: {error.strerror}") from None
+
+
 def _unpack(path: Path, folder: Path, findings: Findings) -> Path:
     """A file that was compressed as a whole, inflated, as far as it goes, to a file in `folder`. Raises BagError."""
     import zstandard
 
-    target = folder / path.stem
+    target = folder / _unpacked_name(path.name)
     try:
         left = max(_ALWAYS_UNPACKED, _MOST_TIMES * path.stat().st_size)
         with path.open("rb") as packed, target.open("xb") as file:
@@ -99,60 +144,151 @@ def _unpack(path: Path, folder: Path, findings: Findings) -> Path:
     return target
 
 
-def _open(path: Path, is_mcap: bool, keep_attachments: bool) -> Storage:
-    if is_mcap:
-        return McapFile(path, keep_attachments)
-    from agv_analysis.bags.rosbags_file import RosbagsFile
+def _open(path: Path, keep_all: bool) -> Storage:
+    begin = _beginning(path)
+    if begin.startswith(b"#ROSBAG V"):
+        raise BagError(f"{path}: is a ROS 1 bag; {_convert(path)}")
+    if begin.startswith(SQLITE) or (path.suffix.lower() == ".db3" and begin):
+        return SqliteFile(path, keep_all)
+    return McapFile(path, keep_all)
 
-    return RosbagsFile(path)
+
+def _convert(path: Path) -> str:
+    """How to make a ROS 2 bag of a ROS 1 bag."""
+    return f"`pip install rosbags && rosbags-convert --src {path} --dst {path.with_suffix('')}` makes a ROS 2 bag of it"
+
+
+# -- names ------------------------------------------------------------------------------------------------------------
+
+
+def _unpacked_name(name: str) -> str:
+    """Name of a file without the ending of its compression."""
+    return next((name.removesuffix(ending) for ending in _PACKED if name.endswith(ending)), name)
+
+
+def _number(path: Path) -> int | None:
+    """Number of a file in a split bag, None if its name has none: 2 for "bag_2.mcap"."""
+    found = re.search(r"_(\d+)$", Path(_unpacked_name(path.name)).stem)
+    return int(found[1]) if found else None
+
+
+def _family(path: Path) -> tuple[str, str]:
+    """What the files of a split bag have in common: "bag" and ".mcap" for "bag_2.mcap"."""
+    name = Path(_unpacked_name(path.name))
+    return re.sub(r"_\d+$", "", name.stem), name.suffix.lower()
+
+
+def _files_in(path: Path) -> list[Path]:
+    """Files of a directory that hold messages by their endings, else by their first bytes, bag_2 before bag_10."""
+    every = [file for file in path.iterdir() if file.is_file()]
+    files = [file for file in every if Path(_unpacked_name(file.name)).suffix.lower() in _STORAGES]
+    files = files or [file for file in every if _beginning(file).startswith((MCAP, SQLITE))]
+    return sorted(files, key=lambda file: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", file.name)])
 
 
 def _by_name(path: Path) -> Contents:
-    """Files of a directory by their endings, bag_2 before bag_10."""
-    names = sorted(
-        path.iterdir(), key=lambda file: [int(n) if n.isdigit() else n for n in re.split(r"(\d+)", file.name)]
-    )
-    mcap = [name for name in names if name.name.endswith((".mcap", f".mcap{_PACKED}"))]
-    if mcap:
-        return Contents(mcap)
-    sqlite = [name for name in names if name.suffix == ".db3"]
-    if sqlite:
-        return Contents(sqlite, is_mcap=False)
-    raise BagError(f"{path}: no bag: there is no .mcap or .db3 file in this directory")
+    """Files of a directory by their endings."""
+    files = _files_in(path)
+    if not files:
+        raise BagError(f"{path}: no bag: there is no .mcap or .db3 file in this directory{_advice(path)}")
+    mcap = [file for file in files if _family(file)[1] == ".mcap"]
+    contents = Contents(mcap or files)
+    for file in files:
+        if file not in contents.files:
+            contents.findings.add(f"{file.name} beside .mcap files, taken for another form of them, not read")
+    _drop_packed_twins(contents)
+    _report_holes(contents)
+    return contents
 
 
-def _numbered(file: Path) -> list[tuple[int, str]]:
-    """Sort key of a file's name, its numbers by their value."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", file.name)]
+def _advice(path: Path) -> str:
+    """What may have been meant where there is no bag."""
+    old = next(iter(sorted(path.glob("*.bag"))), None)
+    if old is not None:
+        return f"; {old.name} is a ROS 1 bag: {_convert(old)}"
+    inner = [folder.name for folder in sorted(path.iterdir()) if folder.is_dir() and _files_in(folder)]
+    return f"; there is one in its folder{'s' * (len(inner) > 1)} {', '.join(inner)}" if inner else ""
+
+
+def _drop_packed_twins(contents: Contents) -> None:
+    """Read a file that is there compressed and not compressed once."""
+    names = {file.name for file in contents.files}
+    for file in list(contents.files):
+        if (plain := _unpacked_name(file.name)) != file.name and plain in names:
+            contents.files.remove(file)
+            contents.findings.add(f"{file.name} not read, because {plain} is there, too")
+
+
+def _report_holes(contents: Contents) -> None:
+    """Report numbers that are missing among the files of a split bag."""
+    families: dict[tuple[str, str], list[int]] = {}
+    for file in contents.files:
+        if (number := _number(file)) is not None:
+            families.setdefault(_family(file), []).append(number)
+    for (stem, suffix), numbers in families.items():
+        for before, after in pairwise(sorted(numbers)):
+            if after > before + 1:
+                missing = f"{stem}_{before + 1}{suffix}"
+                if after > before + 2:
+                    missing += f" to {stem}_{after - 1}{suffix}"
+                contents.findings.add(
+                    f"{missing} missing from the files of a split bag", after - before - 1, is_loss=True
+                )
+
+
+# -- metadata.yaml ----------------------------------------------------------------------------------------------------
 
 
 def _by_metadata(path: Path) -> Contents:
     try:
         about = _read_metadata(path / METADATA)
         listed = [_inside(path, str(name)) for name in about["relative_file_paths"]]
-        storage, mode = str(about["storage_identifier"]), str(about.get("compression_mode") or "").lower()
-        counts = {
-            str(topic["topic_metadata"]["name"]): int(topic["message_count"])
-            for topic in about["topics_with_message_count"]
-        }
+        topics = [
+            (str(topic["topic_metadata"]["name"]), str(topic["topic_metadata"].get("type", "")), topic["message_count"])
+            for topic in about["topics_with_message_count"] or ()
+        ]
+        counts = {name: int(count) for name, _, count in topics}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         contents = _by_name(path)
         contents.findings.add(f"{METADATA} that is not understood ({type(error).__name__}: {error}), not used")
         return contents
-    if mode == "message" or (storage != "mcap" and mode != "file"):
-        return Contents([path], is_mcap=False, counts=counts)
-    if mode == "file" and any(file.suffix != _PACKED for file in listed):
-        return Contents([path], is_mcap=False, counts=counts)
-    contents = Contents([file for file in listed if file.exists()], is_mcap=storage == "mcap", counts=counts)
-    for file in listed:
-        if not file.exists():
-            contents.findings.add(f"{file.name} named by {METADATA} but missing", is_loss=True)
-    for file in sorted(path.glob("*.mcap")):
-        if file not in listed:
-            contents.findings.add(f"{file.name} not named by {METADATA}, not read")
+    types = {name: kind for name, kind, _ in topics}
+    contents = Contents([], counts, types, str(about.get("ros_distro") or ""))
+    contents.files = _present(path, listed, contents.findings)
     if not contents.files:
-        raise BagError(f"{path}: none of the files that {METADATA} names is there")
+        raise BagError(f"{path}: none of the files that {METADATA} names is there{_advice(path)}")
+    if about.get("compression_format") not in (None, "", "zstd"):
+        contents.findings.add(f"compression {about['compression_format']!r} named by {METADATA}, which is not known")
+    _report_holes(contents)
     return contents
+
+
+def _present(path: Path, listed: list[Path], findings: Findings) -> list[Path]:
+    """The files that metadata.yaml lists, or, where one is missing, those that are there in its place."""
+    others = [file for file in _files_in(path) if file not in listed]
+    present: list[Path] = []
+    missing: list[Path] = []
+    for file in listed:
+        twin = next((other for other in others if _unpacked_name(other.name) == _unpacked_name(file.name)), None)
+        if file.is_file():
+            present.append(file)
+        elif twin is not None:
+            others.remove(twin)
+            present.append(twin)
+            findings.add(f"{file.name} named by {METADATA}, {twin.name} read in its place")
+        else:
+            missing.append(file)
+    others = [file for file in others if not any(_unpacked_name(file.name) == _unpacked_name(p.name) for p in present)]
+    renamed = others if missing else []
+    if renamed:
+        names, found = ", ".join(file.name for file in missing), ", ".join(file.name for file in renamed)
+        findings.add(f"{names} named by {METADATA} but missing, {found} read in place of it")
+    for file in missing[len(renamed) :]:
+        findings.add(f"{file.name} named by {METADATA} but missing", is_loss=True)
+    for file in others:
+        if file not in renamed:
+            findings.add(f"{file.name} not named by {METADATA}, not read")
+    return present + renamed
 
 
 def _read_metadata(path: Path) -> dict[str, Any]:

@@ -11,8 +11,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from agv_analysis.bags.bag_errors import UndecodableError
+from agv_analysis.bags.idl import definitions_in_idl
 
 STRING = "string"
+
+PLACEHOLDER = "structure_needs_at_least_one_member"
+"""The member that ROS 2 gives to a message without any, because IDL knows no such struct."""
 
 PRIMITIVES = {
     "bool": "?", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2",
@@ -57,6 +61,11 @@ class Struct:
     members: tuple[Member, ...]
 
     @property
+    def is_empty(self) -> bool:
+        """Is this a message without values?"""
+        return all(m.path.rpartition(".")[2] == PLACEHOLDER for m in self.members)
+
+    @property
     def has_sequences(self) -> bool:
         """Can two messages of this type differ in their number of values?"""
         return any(m.is_sequence or (isinstance(m.element, Struct) and m.element.has_sequences) for m in self.members)
@@ -67,14 +76,23 @@ def parse_schema(name: str, encoding: str, text: str) -> Struct:
 
     Raises UndecodableError if the text is not understood, lacks a type, or describes a type without end.
     """
-    if encoding != "ros2msg":
-        raise UndecodableError(f"its definition is in {encoding or 'no language'!r}; only ros2msg is read")
-    texts = {**_BUILT_IN, **_by_name(_short(name), text)}
-    return Struct(tuple(_Unfolding(texts).members(_short(name), "", 0)))
+    if encoding not in ("ros2msg", "ros2idl"):
+        raise UndecodableError(f"its definition is in {encoding or 'no language'!r}; ros2msg and ros2idl are read")
+    named = _by_name(short_name(name), text) if encoding == "ros2msg" else _by_name_in_idl(name, text)
+    texts = {**_BUILT_IN, **named}
+    return Struct(tuple(_Unfolding(texts).members(short_name(name), "", 0)))
 
 
-def _short(name: str) -> str:
+def short_name(name: str) -> str:
+    """Name of a type as definitions have it: "geometry_msgs/Point" for "geometry_msgs/msg/Point"."""
     return name.replace("/msg/", "/")
+
+
+def _by_name_in_idl(name: str, text: str) -> dict[str, str]:
+    texts = {short_name(kind): definition for kind, definition in definitions_in_idl(text).items()}
+    if short_name(name) not in texts:
+        raise UndecodableError("its definition in IDL does not describe it")
+    return texts
 
 
 def _by_name(name: str, text: str) -> dict[str, str]:
@@ -85,7 +103,7 @@ def _by_name(name: str, text: str) -> dict[str, str]:
         head, _, body = other.strip().partition("\n")
         if not head.startswith("MSG:"):
             raise UndecodableError(f"its definition has a part that begins with {head[:60]!r} instead of 'MSG: type'")
-        texts[_short(head[4:].strip())] = body
+        texts[short_name(head[4:].strip())] = body
     return texts
 
 
@@ -110,8 +128,8 @@ class _Unfolding:
             if self._count > _MAX_MEMBERS:
                 raise UndecodableError(f"its definition has more than {_MAX_MEMBERS} members")
             yield from self._unfold(name, prefix, member, depth)
-        if empty:  # IDL knows no struct without members, so ROS 2 puts one there
-            yield Member(f"{prefix}structure_needs_at_least_one_member", "u1")
+        if empty:
+            yield Member(f"{prefix}{PLACEHOLDER}", "u1")
 
     def _unfold(self, parent: str, prefix: str, member: Member, depth: int) -> Iterator[Member]:
         path, kind = prefix + member.path, str(member.element)
@@ -126,7 +144,7 @@ class _Unfolding:
 
     def _resolve(self, kind: str, parent: str) -> str:
         """Full name of a type as a member of `parent` names it."""
-        short = _short(kind)
+        short = short_name(kind)
         package = parent.rpartition("/")[0]
         candidates = [short] if "/" in short else [f"{package}/{short}", f"std_msgs/{short}"]
         for candidate in candidates:

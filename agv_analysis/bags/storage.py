@@ -17,17 +17,28 @@ LARGE = 2**24
 IsWanted = Callable[[Channel], bool]
 
 
+def undescribed(number: int) -> Channel:
+    """A channel for messages whose own one is not described, so that their topic is not known."""
+    return Channel(number, 0, f"/undescribed_channel_{number}", "", {})
+
+
 class Storage(Protocol):
     """One file of a bag; everything but the batches is complete only after these have been read."""
 
     path: Path
     findings: Findings
-    metadata: dict[str, dict[str, str]]
+    metadata: list[tuple[str, dict[str, str]]]
+    """Metadata records: name and content; a name may be there more than once."""
     attachments: list[Attachment]
     counts: Counter[int]
     """Messages found by channel."""
     position: int
     """How much has been read, of `size`."""
+
+    @property
+    def distro(self) -> str:
+        """ROS distribution of the recorder, empty if the file does not say."""
+        ...
 
     @property
     def size(self) -> int:

@@ -43,13 +43,14 @@ _VERSION = 9  # of the metadata of rosbag2 in Jazzy
 
 
 class TopicInfo(NamedTuple):
-    """What a bag says of a topic: name, type, definition, hash of the type (RIHS01), QoS that its publishers offer."""
+    """What a bag says of a topic: name, type, definition, hash of the type (RIHS01), QoS of publishers, encoding."""
 
     name: str
     type: str
     schema: str
     type_hash: str
     offered_qos: Sequence[dict[str, Any]]
+    encoding: str = "cdr"
 
 
 @contextmanager
@@ -172,7 +173,7 @@ def _topic_metadata(topic: TopicInfo) -> dict[str, Any]:
     return {
         "name": topic.name,
         "type": topic.type,
-        "serialization_format": "cdr",
+        "serialization_format": topic.encoding,
         "offered_qos_profiles": list(topic.offered_qos),
         "type_description_hash": topic.type_hash,
     }

@@ -308,7 +308,7 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
     with pytest.raises(BagError, match=r"empty\.mcap: is empty"):
         read_bag(tmp_path / "empty.mcap")
     (tmp_path / "bad.db3").write_bytes(b"SQLite format 3\0" + bytes(200))
-    with pytest.raises(BagError, match="rosbags cannot open it"):
+    with pytest.raises(BagError, match="sqlite3 cannot open it: file is not a database"):
         read_bag(tmp_path / "bad.db3")
 
 

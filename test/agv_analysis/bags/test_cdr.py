@@ -260,8 +260,8 @@ def test_a_definition_that_cannot_be_used(text: str, complaint: str) -> None:
 
 
 def test_a_definition_in_another_language_is_refused() -> None:
-    with pytest.raises(UndecodableError, match="ros2idl"):
-        parse_schema("a/A", "ros2idl", "")
+    with pytest.raises(UndecodableError, match="its definition is in 'omgidl'; ros2msg and ros2idl are read"):
+        parse_schema("a/A", "omgidl", "")
 
 
 def test_constants_comments_defaults_and_bounds() -> None:

@@ -1,0 +1,243 @@
+"""Definitions that a bag does not hold itself: those of a folder, and those of the ROS 2 distributions.
+
+Bags in sqlite3 have none before Iron, and a recorder that does not find a definition leaves it empty. Types of the
+distributions have changed over the years, so which one is meant decides, in this order, the recorded hash of the type,
+the distribution that the bag names, and which of the definitions describes a message to its last byte. If that leaves
+more than one, the topic is not decoded: a number that may be wrong is worse than none.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from agv_analysis.bags.bag_errors import BagError, UndecodableError
+from agv_analysis.bags.idl import definitions_in_idl
+from agv_analysis.bags.layout import trace
+from agv_analysis.bags.message_batch import NO_DEFINITION
+from agv_analysis.bags.message_definitions import assemble, installed_definition
+from agv_analysis.bags.records import Schema
+from agv_analysis.bags.schema import parse_schema
+from agv_ros.errors import UserError
+
+_ENDINGS = (".msg", ".idl", ".srv")
+_EVENT = "_Event"
+
+
+class Definition(NamedTuple):
+    """A definition with those of all types in it, and where it is from."""
+
+    schema: Schema
+    source: str
+    """As in "ROS 2 humble"; empty if the bag holds it."""
+
+
+class _Known(NamedTuple):
+    text: str
+    hash: str
+    """RIHS01, empty if it is not known."""
+    source: str
+
+
+def is_undefined(schema: Schema) -> bool:
+    """Does a bag name this type without defining it? A type without members looks the same."""
+    return schema.encoding in ("", "ros2msg", "ros2idl") and not schema.data.strip()
+
+
+class KnownTypes:
+    """Definitions from outside of a bag."""
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """`folder`: holds .msg, .idl or .srv files, as a package, a workspace's `share` or `src`, or loosely.
+
+        Raises BagError if it does not.
+        """
+        self._folder = folder
+        self._files: dict[str, Path] = {}
+        if folder is None:
+            return
+        for file in sorted(folder.rglob("*")):
+            if file.suffix in _ENDINGS and file.is_file():
+                self._files.setdefault(_name_of(file), file)
+        if not self._files:
+            raise BagError(f"{folder}: no definitions: there is no .msg, .idl or .srv file in it or in its folders")
+
+    def define(self, schema: Schema, distro: str, type_hash: str, message: bytes | None) -> Definition:
+        """The definition of a type: the bag's own `schema`, or, if that is empty, one from elsewhere.
+
+        `distro`, `type_hash`: what the bag says, or empty; `message`: one of the type, behind its lead.
+        Raises UndecodableError if no definition is known, or more than one and nothing says which.
+        """
+        if not is_undefined(schema):
+            return Definition(schema, "")
+        fitting = [
+            known for known in self._candidates(schema.name, distro, type_hash) if _fits(schema.name, known, message)
+        ]
+        if not fitting:
+            if schema.encoding == "ros2msg":  # one without members, if its messages have no values either
+                return Definition(schema, "")
+            raise UndecodableError(NO_DEFINITION)
+        by_form = {_form(schema.name, known.text): known for known in reversed(fitting)}
+        if len(by_form) > 1 and message is not None:
+            sources = ", ".join(known.source for known in fitting)
+            raise UndecodableError(f"{NO_DEFINITION}, and there are several that fit it ({sources})")
+        chosen = next(iter(by_form.values()))
+        is_empty = _form(schema.name, chosen.text).is_empty
+        found = schema.defined_by("ros2msg", chosen.text.encode())
+        return Definition(found, "" if is_empty else chosen.source)
+
+    def _candidates(self, kind: str, distro: str, type_hash: str) -> list[_Known]:
+        if self._folder is not None and (text := self._of_folder(kind, distro)) is not None:
+            return [_Known(text, "", str(self._folder))]
+        found = list(_of_distributions(kind, distro))
+        if type_hash and (proven := [known for known in found if known.hash == type_hash]):
+            return proven[:1]
+        if not found and (text := _assembled(kind, _installed)) is not None:
+            return [_Known(text, "", "the installed ROS 2")]
+        return found
+
+    def _of_folder(self, kind: str, distro: str) -> str | None:
+        """Definition by the folder, with types that it does not hold from the distributions."""
+        if self._read(kind) is None and self._read(_service(kind)) is None:
+            return None
+
+        def find(name: str) -> str | None:
+            text = self._read(name)
+            if text is None and (others := _of_distributions(name, distro)):
+                text = others[0].text.split("\n====")[0]
+            return _installed(name) if text is None else text
+
+        return _assembled(kind, find)
+
+    def _read(self, kind: str) -> str | None:
+        """Text of one definition of the folder in the message language, without those of the types in it."""
+        package, _, rest = kind.partition("/")
+        short = rest.rpartition("/")[2]
+        part = "msg" if rest.startswith("msg/") or "/" not in rest else rest.partition("/")[0]
+        for name in (f"{package}/{part}/{short}", f"/{short}"):
+            if name in self._files:
+                return _text_of(self._files[name], f"{package}/{part}/{short}")
+        return None
+
+
+def _name_of(file: Path) -> str:
+    """Type that a file defines: "package/msg/Name", or "/Name" if its folder does not say the package."""
+    folder = file.parent
+    if folder.name in ("msg", "srv"):
+        return f"{folder.parent.resolve().name}/{folder.name}/{file.stem}"
+    return f"/{file.stem}"
+
+
+def _text_of(file: Path, kind: str) -> str:
+    try:
+        text = file.read_bytes().decode("utf-8", "replace")
+    except OSError as error:
+        raise BagError(f"{file}: cannot be read: {error.strerror}") from None
+    if file.suffix != ".idl":
+        return text
+    try:
+        found = definitions_in_idl(text)
+    except UndecodableError as error:
+        raise BagError(f"{file}: {error}") from None
+    if "/srv/" in kind:
+        return f"{found.get(f'{kind}_Request', '')}\n---\n{found.get(f'{kind}_Response', '')}"
+    return found.get(kind, "")
+
+
+# -- services ---------------------------------------------------------------------------------------------------------
+
+
+def _service(kind: str) -> str:
+    """Service that an event is of: "std_srvs/srv/Trigger" for "std_srvs/srv/Trigger_Event"."""
+    for ending in (_EVENT, "_Request", "_Response"):
+        if "/srv/" in kind and kind.endswith(ending):
+            return kind.removesuffix(ending)
+    return ""
+
+
+def _assembled(kind: str, find: Callable[[str], str | None]) -> str | None:
+    """Definition of a message or service event with those of all types in it; None if one is not found.
+
+    Source of events: rosidl's `service_msgs/msg/ServiceEventInfo`, and at most one request and one response.
+    """
+
+    def definition(name: str) -> str:
+        service = _service(name)
+        if service and name.endswith(_EVENT):
+            parts = "".join(f"{service}_{part}[<=1] {part.lower()}\n" for part in ("Request", "Response"))
+            return f"service_msgs/ServiceEventInfo info\n{parts}"
+        text = find(service) if service else find(_long(name))
+        if text is None:
+            raise UserError(name)
+        if not service:
+            return text
+        request, _, response = text.partition("---")
+        return response if name.endswith("_Response") else request
+
+    try:
+        return assemble(kind, definition)
+    except UserError:
+        return None
+
+
+def _long(name: str) -> str:
+    """Full name of a message type: "geometry_msgs/msg/Point" for "geometry_msgs/Point"."""
+    package, _, rest = name.partition("/")
+    return name if "/" in rest else f"{package}/msg/{rest}"
+
+
+def _installed(name: str) -> str | None:
+    try:
+        return installed_definition(name)
+    except UserError:
+        return None
+
+
+# -- the distributions ------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _of_distributions(kind: str, distro: str) -> tuple[_Known, ...]:
+    """Definitions of a type in the distribution that is named, or in all; equal ones once, the newest first."""
+    found: dict[str, list[str]] = {}
+    hashes: dict[str, str] = {}
+    for name, store in _stores(distro):
+        if kind not in store.types:
+            continue
+        text = str(store.generate_msgdef(kind, ros_version=2)[0])
+        found.setdefault(text, []).append(name)
+        hashes[text] = str(store.hash_rihs01(kind))
+    return tuple(_Known(text, hashes[text], f"ROS 2 {_range(names)}") for text, names in found.items())
+
+
+def _range(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[-1]} to {names[0]}"
+
+
+def _stores(distro: str) -> Iterator[tuple[str, Any]]:
+    """Types of the distribution that is named, or, if it is not known, of all, the newest first."""
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        return
+    names = {store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")}
+    chosen = {distro: names[distro]} if distro in names else dict(reversed(names.items()))
+    for name, store in chosen.items():
+        yield name, get_typestore(store)
+
+
+def _form(kind: str, text: str) -> Any:
+    return parse_schema(kind, "ros2msg", text)
+
+
+def _fits(kind: str, known: _Known, message: bytes | None) -> bool:
+    """Does a definition describe a message to its last byte? One that cannot be parsed does not."""
+    try:
+        form = _form(kind, known.text)
+        if message is not None:
+            trace(form, message)
+    except UndecodableError:
+        return False
+    return True

@@ -1,0 +1,129 @@
+"""Directories in disorder: every message that is there is read, and every disagreement is said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from agv_analysis.bags import BagError, read_bag
+
+Payloads = dict[str, list[tuple[int, bytes]]]
+Odd = Callable[[str], Path]
+
+
+def test_every_message_that_other_readers_find_is_found(any_bag: Path, by_others: Callable[[Path], Payloads]) -> None:
+    bag = read_bag(any_bag)
+    found = {topic: sorted(bag.payloads(topic)) for topic in bag.topics}
+    assert found == {topic: sorted(data for _, data in messages) for topic, messages in by_others(any_bag).items()}
+    assert {topic: bag.topics[topic].count for topic in found} == {topic: len(data) for topic, data in found.items()}
+    if "/point" in bag.arrays and bag.topics["/point"].type == "geometry_msgs/msg/Point" and len(bag["/point"]):
+        assert sorted(bag["/point"]["x"].tolist()) == [float(i) for i in range(7)]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("renamed topic in metadata.yaml", "/point: topic that metadata.yaml calls /position: 1"),
+        ("renamed data file", "bag_0.db3 named by metadata.yaml but missing, monday.db3 read in place of it: 1"),
+        ("renamed split", "x_1.db3 named by metadata.yaml but missing, y_1.db3 read in place of it: 1"),
+        ("compressed by hand", "x_1.db3.zstd named by metadata.yaml, x_1.db3.zst read in its place: 1"),
+        ("path of a file of a split", "x_1.db3.zstd is one of 2 files of a split bag, all of them read: 1"),
+        ("compressed splits without metadata.yaml", "directory without metadata.yaml, all of its files read in the "
+         "order of their numbers: 1"),
+    ],
+)  # fmt: skip
+def test_disorder_is_said_and_no_loss(odd_bag: Odd, name: str, said: str) -> None:
+    bag = read_bag(odd_bag(name))
+    assert said in bag.problems
+    assert bag.is_complete
+
+
+@pytest.mark.parametrize("name", ["other QoS in metadata.yaml", "no storage identifier", "path of metadata.yaml"])
+def test_what_changes_nothing_is_not_said(odd_bag: Odd, name: str) -> None:
+    bag = read_bag(odd_bag(name))
+    assert not any("metadata.yaml" in problem for problem in bag.problems)
+    assert bag.is_complete
+    assert bag.topics["/point"].offered_qos == "- depth: 1"
+
+
+def test_a_hole_in_a_split_is_a_loss(odd_bag: Odd) -> None:
+    bag = read_bag(odd_bag("split with a hole"))
+    assert "x_1.db3 missing from the files of a split bag: 1" in bag.problems
+    assert not bag.is_complete
+
+
+def test_one_file_of_a_split_without_metadata_is_read_alone(odd_bag: Odd) -> None:
+    folder = odd_bag("split with a hole")
+    bag = read_bag(folder / "x_2.db3")
+    assert sum(topic.count for topic in bag.topics.values()) == 7
+    assert "x_2.db3 read alone; beside it, of the same split bag: x_0.db3: 1" in bag.problems
+
+
+def test_a_file_that_is_there_twice_is_read_once(odd_bag: Odd) -> None:
+    import zstandard
+
+    folder = odd_bag("split with a hole")
+    (folder / "x_0.db3.zstd").write_bytes(zstandard.compress((folder / "x_0.db3").read_bytes()))
+    bag = read_bag(folder)
+    assert sum(topic.count for topic in bag.topics.values()) == 14
+    assert "x_0.db3.zstd not read, because x_0.db3 is there, too: 1" in bag.problems
+
+
+def test_a_bag_of_ros_1_is_named_with_its_converter(tmp_path: Path) -> None:
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    for path in (tmp_path / "old.bag", tmp_path):
+        with pytest.raises(BagError, match=f"is a ROS 1 bag.*rosbags-convert --src {tmp_path}/old.bag --dst"):
+            read_bag(path)
+
+
+def test_the_folder_above_a_bag_names_it(odd_bag: Odd) -> None:
+    with pytest.raises(BagError, match="there is one in its folder bag"):
+        read_bag(odd_bag("directory of Humble").parent)
+
+
+def test_the_true_reason_why_a_database_is_not_decoded(tmp_path: Path, make_database: Callable[..., Path]) -> None:
+    event = [("/add/_service_event", "my_srvs/srv/Add_Event", 1, b"\0\1\0\0" + bytes(60))]
+    bag = read_bag(make_database(tmp_path / "a.db3", part=event))
+    assert any("/add/_service_event: topic that cannot be decoded: the bag does not" in text for text in bag.problems)
+    bag = read_bag(make_database(tmp_path / "b.db3", form="protobuf"))
+    with pytest.raises(BagError, match="/point: cannot be decoded: its messages are encoded as 'protobuf'; only cdr"):
+        bag["/point"]
+    assert len(bag.payloads("/point")) == 7
+
+
+def test_rows_of_a_topic_that_is_not_described_are_counted(tmp_path: Path, make_database: Callable[..., Path]) -> None:
+    import sqlite3
+
+    path = make_database(tmp_path / "a.db3")
+    database = sqlite3.connect(path)
+    database.execute("DELETE FROM topics WHERE name = '/point'")
+    database.commit()
+    database.close()
+    bag = read_bag(path)
+    assert "message of topic 1, which is not described, so that its name is not known: 7" in bag.problems
+    assert not bag.is_complete
+
+
+def test_a_damaged_database_is_read_behind_the_damage(tmp_path: Path, make_database: Callable[..., Path]) -> None:
+    """Pages of messages in the middle are overwritten: what sqlite3 finds before and behind them comes back."""
+    rows = [("/point", "geometry_msgs/msg/Point", i + 1, b"\0\1\0\0" + bytes(24 + 500)) for i in range(400)]
+    path = make_database(tmp_path / "a.db3", part=rows)
+    data = bytearray(path.read_bytes())
+    page = 4096
+    leaves = [at for at in range(0, len(data), page) if data[at] == 0x0D and data.count(bytes(300), at, at + page)]
+    for at in leaves[20:22]:
+        data[at : at + page] = b"\xff" * page
+    path.write_bytes(data)
+    bag = read_bag(path)
+    assert 360 < len(bag.payloads("/point")) < 400
+    assert not bag.is_complete
+
+
+def test_a_database_that_is_no_bag_is_refused(tmp_path: Path) -> None:
+    import sqlite3
+
+    sqlite3.connect(tmp_path / "a.db3").execute("CREATE TABLE t(x)").connection.close()
+    with pytest.raises(BagError, match="a database, but no bag: it lacks rosbag2's tables `topics` and `messages`"):
+        read_bag(tmp_path / "a.db3")

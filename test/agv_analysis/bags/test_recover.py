@@ -1,0 +1,86 @@
+"""`recover` writes all that is whole, whether or not this package can decode it, and says what it could not check."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from agv_analysis.bags import BagError, read_bag
+from agv_analysis.bags.message_batch import NO_DEFINITION
+from agv_analysis.bags.recover import recover
+
+Payloads = dict[str, list[tuple[int, bytes]]]
+By = Callable[[Path], Payloads]
+
+
+def test_every_byte_of_every_message_is_recovered(any_bag: Path, by_others: By, tmp_path: Path) -> None:
+    original = by_others(any_bag)
+    recovery = recover(any_bag, tmp_path / "out")
+    assert recovery.is_complete == ("x_2.db3" not in {file.name for file in any_bag.glob("*")})  # a hole in a split
+    assert by_others(tmp_path / "out") == original
+    assert recovery.counts == {topic: len(messages) for topic, messages in original.items()}
+    assert sum(recovery.counts.values()) == 14
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("mcap, empty definitions", NO_DEFINITION),
+        ("mcap, no schemas", NO_DEFINITION),
+        ("mcap, binary schemas", "its definition is in 'protobuf'; ros2msg and ros2idl are read"),
+        ("mcap, another encoding", "they are encoded as 'protobuf'"),
+        ("sqlite3 of Humble", NO_DEFINITION),
+    ],
+)
+def test_what_is_copied_unchecked_is_counted_and_named(
+    odd_bag: Callable[[str], Path], tmp_path: Path, name: str, reason: str
+) -> None:
+    recovery = recover(odd_bag(name), tmp_path / "out.mcap")
+    assert f"/reading: message copied as it is, unchecked ({reason}): 7" in recovery.problems
+    info = read_bag(tmp_path / "out.mcap")
+    assert any(problem.startswith("/reading: topic that cannot be decoded") for problem in info.problems)
+    with pytest.raises(BagError, match="/reading: cannot be decoded"):
+        info["/reading"]
+    assert len(info.payloads("/reading")) == 7
+
+
+def test_messages_that_contradict_their_definition_are_copied_and_counted(
+    odd_bag: Callable[[str], Path], tmp_path: Path
+) -> None:
+    recovery = recover(odd_bag("mcap, wrong definitions"), tmp_path / "out.mcap")
+    assert recovery.counts == {"/point": 7, "/reading": 7}
+    said = "/point: message that its definition does not describe, copied as it is"
+    assert any(problem.startswith(said) and problem.endswith(": 7") for problem in recovery.problems)
+
+
+def test_definitions_metadata_and_attachments_are_copied_byte_by_byte(
+    odd_bag: Callable[[str], Path], tmp_path: Path
+) -> None:
+    recover(odd_bag("mcap, binary schemas"), tmp_path / "out.mcap")
+    with (tmp_path / "out.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert {(schema.encoding, schema.data) for schema in summary.schemas.values()} == {("protobuf", b"\xff\xfe\0")}
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("notes", {"a": "1"}), ("notes", {"a": "2"})]
+        assert [(a.name, a.media_type, len(a.data)) for a in reader.iter_attachments()] == [
+            ("map.png", "image/png", 54)
+        ]
+        assert {c.topic: c.metadata for c in summary.channels.values()} == {
+            t: {"id": t} for t in ("/point", "/reading")
+        }
+
+
+def test_messages_whose_topic_is_not_known_are_recovered(tmp_path: Path, make_record: Callable[..., bytes]) -> None:
+    """The record that describes the channel may be what was damaged."""
+    body = (1).to_bytes(2, "little") + bytes(4) + (5).to_bytes(8, "little") * 2 + b"\0\1\0\0\7\0\0\0"
+    magic = b"\x89MCAP0\r\n"
+    parts = [make_record(1, bytes(8)), make_record(5, body), make_record(15, bytes(4)), make_record(2, bytes(20))]
+    (tmp_path / "a.mcap").write_bytes(magic + b"".join(parts) + magic)
+    recovery = recover(tmp_path / "a.mcap", tmp_path / "out.mcap")
+    assert recovery.counts == {"/undescribed_channel_1": 1}
+    assert "message of channel 1, which is not described, so that its topic is not known: 1" in recovery.problems
+    assert read_bag(tmp_path / "out.mcap").payloads("/undescribed_channel_1") == [b"\0\1\0\0\7\0\0\0"]
