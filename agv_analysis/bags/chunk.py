@@ -14,7 +14,7 @@ from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.chunk_index import index_chunk
 from agv_analysis.bags.compression import MAX_CHUNK, NAMES, compression_of, declared_size, inflate, inflate_start
 from agv_analysis.bags.message_batch import Bytes, Ints, numbers_at
-from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Index, Read, has_shape, is_known
+from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD, Chunk, Index, Read, fields_end, is_known
 
 _HEAD = 8 + 8 + 8 + 4
 """Bytes of a chunk record before the name of its compression."""
@@ -216,7 +216,7 @@ def walk(content: bytes, is_cut: bool = False) -> Content:
         starts += run
         if position == len(content):
             break
-        definition = _definition(content, position)
+        definition = _definition(content, position, is_cut)
         if definition is not None:
             definitions.append(definition)
             position += RECORD.size + len(definition.content)
@@ -246,17 +246,36 @@ def run_of_messages(content: bytes, position: int) -> tuple[list[int], int]:
     return starts, position
 
 
-def _definition(content: bytes, position: int) -> Definition | None:
-    """The record, other than a message, at `position`; None if there is no whole one."""
+def _definition(content: bytes, position: int, is_cut: bool) -> Definition | None:
+    """The record, other than a message, at `position`; None if there is no whole one.
+
+    One of a kind that is not known, or with bytes after its last field, must be followed by another or by the end.
+    """
     if position + RECORD.size > len(content):
         return None
     opcode, length = RECORD.unpack_from(content, position)
     begin = position + RECORD.size
-    if opcode == MESSAGE or not is_known(opcode) or begin + length > len(content):
+    end = begin + length
+    if opcode in (0, MESSAGE) or end > len(content):
         return None
-    if not has_shape(opcode, length, lambda offset, count: content[begin + offset : begin + offset + count]):
-        return None
-    return Definition(opcode, content[begin : begin + length])
+    if is_known(opcode):
+        fields = fields_end(opcode, length, lambda offset, count: content[begin + offset : begin + offset + count])
+        if fields is None:
+            return None
+        if fields == length:
+            return Definition(opcode, content[begin:end])
+    return Definition(opcode, content[begin:end]) if _is_followed(content, end, is_cut) else None
+
+
+def _is_followed(content: bytes, position: int, is_cut: bool) -> bool:
+    """Is at `position` the end of a chunk, or what may be a record?"""
+    if position == len(content):
+        return True
+    if position + RECORD.size > len(content):
+        return is_cut
+    opcode, length = RECORD.unpack_from(content, position)
+    is_whole = position + RECORD.size + length <= len(content)
+    return bool(opcode) and (is_whole or is_cut) and (opcode != MESSAGE or length >= MESSAGE_HEAD)
 
 
 _MESSAGE_START = re.compile(rb"(?=\x05.{5}\x00{3})", re.DOTALL)

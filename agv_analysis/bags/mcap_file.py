@@ -50,6 +50,7 @@ from agv_analysis.bags.records import (
     CHUNK,
     DATA_END,
     DATA_END_SIZE,
+    DATA_KINDS,
     FOOTER,
     FOOTER_SIZE,
     HEADER,
@@ -58,6 +59,7 @@ from agv_analysis.bags.records import (
     MESSAGE_HEAD,
     MESSAGE_INDEX,
     METADATA,
+    PRIVATE,
     RECORD,
     SCHEMA,
     STATISTICS,
@@ -91,6 +93,11 @@ _MOST_TOGETHER = 1000
 
 _AHEAD = 3 * _TOGETHER
 """Bytes that may be inflated ahead, unless a single chunk has more; a processor's cache holds them until their turn."""
+
+EXTENDED = "record with bytes after the last field that is known here, these ignored"
+
+_LONGEST_FOOTER = 2**12
+"""Bytes before the end in which a footer with more fields than today's is looked for."""
 
 _MAX_DAMAGES = 10_000
 """Damaged places of a file that are skipped, at most."""
@@ -138,6 +145,17 @@ class _Some(NamedTuple):
     items: list[_Item]
     size: int
     """Bytes, when inflated."""
+
+
+def _has_shape(record: Record, opcode: int) -> bool:
+    content = record.content
+    return has_shape(opcode, len(content), lambda at, count: content[at : at + count])
+
+
+def _unknown(opcode: int) -> str:
+    """What is said of a record of a kind that is not known here."""
+    kind = "private" if opcode >= PRIVATE else "unknown"
+    return f"record of the {kind} kind {opcode}, passed over"
 
 
 class McapFile:
@@ -230,7 +248,7 @@ class McapFile:
 
     def _read_summary(self) -> None:
         """Definitions and statistics from the end of the file, where they can be had before the first message."""
-        end = self._source.size - len(MAGIC) - FOOTER_SIZE
+        end = self._footer_position()
         footer = self._footer(end)
         if footer is None:
             return
@@ -249,6 +267,18 @@ class McapFile:
             self._define(Definition(record.opcode, record.content), is_proven)
         if self.statistics is None:
             self.findings.add("file without statistics, in which a missing message would go undetected")
+
+    def _footer_position(self) -> int:
+        """Where the footer is, if there is one: at its place, or before it, if a newer version has added fields."""
+        end = self._source.size - len(MAGIC)
+        usual = end - FOOTER_SIZE
+        if usual >= len(MAGIC) and self._source.read(usual, 1)[0] != FOOTER:
+            begin = max(len(MAGIC), usual - _LONGEST_FOOTER)
+            tail = self._source.read(begin, end - begin)
+            for at in range(len(tail) - RECORD.size, -1, -1):
+                if tail[at] == FOOTER and RECORD.unpack_from(tail, at)[1] == end - begin - at - RECORD.size:
+                    return begin + at
+        return usual
 
     def _footer(self, position: int) -> Footer | None:
         record = next(self._sound_records(position, position + 1), None)
@@ -278,9 +308,14 @@ class McapFile:
     def _check_data_section(self, end: int) -> None:
         """Compare the CRC over everything before the DataEnd record at `end`, if there is one."""
         record = next(self._sound_records(end, end + 1), None)
-        if record is None or record.opcode != DATA_END or not any(record.content):
+        if record is not None and record.opcode == DATA_END:
+            self._compare_data_section(record)
+
+    def _compare_data_section(self, record: Record) -> None:
+        """Compare the CRC that a DataEnd record holds, if it does."""
+        if not any(record.content[:4]):
             return
-        if self._crc(0, end) == int.from_bytes(record.content, "little"):
+        if self._crc(0, record.position) == int.from_bytes(record.content[:4], "little"):
             self._is_proven = True
         else:
             self.findings.add("data section that does not match its CRC", is_loss=True)
@@ -328,6 +363,8 @@ class McapFile:
                 self.metadata.append(parse_metadata(record.content))
                 if not self._is_proven:
                     self.findings.add_unchecked("metadata records")
+            elif record.opcode == DATA_END and record.extra:  # not where it was looked for
+                self._compare_data_section(record)
             elif record.opcode == ATTACHMENT:
                 self._take_attachment(record)
             else:
@@ -336,14 +373,16 @@ class McapFile:
             self.findings.add(f"damaged record, not used ({error})", at=record.position)
 
     def _take_attachment(self, record: Record) -> None:
-        attachment, crc = parse_attachment(record.content)
-        if crc and crc32(record.content[:-4]) != crc:
+        attachment, crc, covered = parse_attachment(record.content)
+        if crc and crc32(record.content[:covered]) != crc:
             self.findings.add("attachment that does not match its CRC, left out", at=record.position, is_loss=True)
         elif self._keep_all:
             self.attachments.append(attachment)
 
     def _define(self, definition: Definition, is_proven: bool) -> None:
-        if definition.opcode in (SCHEMA, CHANNEL):
+        if not is_known(definition.opcode):
+            self.findings.add(_unknown(definition.opcode))
+        elif definition.opcode in (SCHEMA, CHANNEL):
             try:
                 self._definitions.add(definition, is_proven)
             except DamagedError as error:
@@ -368,20 +407,37 @@ class McapFile:
     def _next(self, position: int) -> tuple[Record | _Run | _Packed | None, int]:
         """What is at `position`, and where it ends. Raises DamagedError."""
         record = self._source.record(position)
+        if record.extra:
+            if record.opcode != CHUNK and (packed := self._disguised(record)):
+                return packed, record.end
+            self._doubt(record)
+            self.findings.add(EXTENDED, at=position)
         if record.opcode == MESSAGE:
             return self._run(record)
         if record.opcode == CHUNK:
             return self._packed(record)
         if is_known(record.opcode):
             return record, record.end
-        content = record.content
-        if has_shape(CHUNK, len(content), lambda at, count: content[at : at + count]):
-            self.findings.add("chunk under another opcode", at=position)
-            return _Packed(position, parse_chunk(content), []), record.end
-        if not (self._source.is_end(record.end) or self._source.is_record(record.end)):
+        if packed := self._disguised(record):
+            return packed, record.end
+        if not self._source.is_followed(record.end):
             raise DamagedError(f"a record of the unknown kind {record.opcode}")
-        self.findings.add(f"record of the unknown kind {record.opcode}, passed over", at=position)
+        self.findings.add(_unknown(record.opcode), at=position)
         return None, record.end
+
+    def _disguised(self, record: Record) -> _Packed | None:
+        """The chunk that a record is whose opcode says otherwise; None if it has not the shape of one."""
+        if not _has_shape(record, CHUNK):
+            return None
+        self.findings.add("chunk under another opcode", at=record.position)
+        return _Packed(record.position, parse_chunk(record.content), [])
+
+    def _doubt(self, record: Record) -> None:
+        """Raise DamagedError if bytes after a record's last field look like a wrong opcode or a wrong inner length."""
+        if any(_has_shape(record, kind) for kind in DATA_KINDS if (kind ^ record.opcode).bit_count() == 1):
+            raise DamagedError("a record of another shape than its kind")
+        if record.opcode == CHUNK:
+            open_chunk(parse_chunk(record.content))
 
     def _packed(self, record: Record) -> tuple[_Packed, int]:
         """A chunk with the sound message indexes that follow it, and where they end."""
@@ -397,7 +453,7 @@ class McapFile:
         content = self._source.read(position, max(_WINDOW, first.end - position))
         starts, length = run_of_messages(content, 0)
         end = position + length
-        if self._source.is_end(end) or self._source.is_record(end, depth=0):
+        if self._source.is_record(end, depth=0) or self._source.is_followed(end):
             return _Run(position, content, starts), end
         after = self._source.next_record(position + starts[-1])
         if after is not None and is_wrong_length(position + starts[-1], end, after):

@@ -24,6 +24,12 @@ RECORD = struct.Struct("<BQ")
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 9, 10, 11, 12, 13, 14, 15
 
+DATA_KINDS = (SCHEMA, CHANNEL, ATTACHMENT, METADATA)
+"""Opcodes of records other than messages and chunks that hold what is nowhere else."""
+
+PRIVATE = 0x80
+"""Opcodes from here on are left to applications."""
+
 MESSAGE_HEAD = 22
 """Bytes of a message record before its payload: channel (2), sequence (4), log time (8), publish time (8)."""
 
@@ -54,8 +60,16 @@ def is_known(opcode: int) -> bool:
 
 def has_shape(opcode: int, length: int, read: Read) -> bool:
     """Do the lengths inside a record of a known kind add up to its own? `read` counts from the record's content."""
-    if opcode == MESSAGE:
-        return length >= MESSAGE_HEAD
+    return fields_end(opcode, length, read) == length
+
+
+def fields_end(opcode: int, length: int, read: Read) -> int | None:
+    """Where the fields end that a record of a known kind has; None if that is beyond its length.
+
+    What follows them, up to its length, are fields that a newer version of MCAP may add: to be ignored.
+    """
+    if opcode == MESSAGE:  # whatever follows its head is payload
+        return length if length >= MESSAGE_HEAD else None
     position = 0
     for part in _SHAPES[opcode]:
         if part in "bB":
@@ -64,8 +78,8 @@ def has_shape(opcode: int, length: int, read: Read) -> bool:
         else:
             position += int(part)
         if position > length:
-            return False
-    return position == length
+            return None
+    return position
 
 
 class Cursor:
@@ -73,14 +87,14 @@ class Cursor:
 
     def __init__(self, content: bytes) -> None:
         self._content = content
-        self._position = 0
+        self.position = 0
 
     def take(self, count: int) -> bytes:
         """The next `count` bytes."""
-        begin, self._position = self._position, self._position + count
-        if self._position > len(self._content):
+        begin, self.position = self.position, self.position + count
+        if self.position > len(self._content):
             raise DamagedError(f"a length of {count} where {len(self._content) - begin} bytes are left")
-        return self._content[begin : self._position]
+        return self._content[begin : self.position]
 
     def number(self, size: int) -> int:
         """An unsigned integer of `size` bytes."""
@@ -109,7 +123,7 @@ class Cursor:
     @property
     def is_at_end(self) -> bool:
         """Has everything been read?"""
-        return self._position >= len(self._content)
+        return self.position >= len(self._content)
 
 
 @dataclass(frozen=True)
@@ -220,12 +234,13 @@ def parse_metadata(content: bytes) -> tuple[str, dict[str, str]]:
     return cursor.text(), cursor.texts()
 
 
-def parse_attachment(content: bytes) -> tuple[Attachment, int]:
-    """Attachment record, and the CRC of all that is before it in the record (0: none). Raises DamagedError."""
+def parse_attachment(content: bytes) -> tuple[Attachment, int, int]:
+    """Attachment record, its CRC (0: none), and how many bytes of the record that covers. Raises DamagedError."""
     cursor = Cursor(content)
     log_time, create_time = cursor.number(8), cursor.number(8)
     attachment = Attachment(cursor.text(), cursor.text(), log_time, create_time, cursor.block(8))
-    return attachment, cursor.number(4)
+    covered = cursor.position
+    return attachment, cursor.number(4), covered
 
 
 def parse_statistics(content: bytes) -> Statistics:

@@ -12,7 +12,18 @@ import numpy as np
 
 from agv_analysis.bags.bag_errors import BagError, DamagedError
 from agv_analysis.bags.compression import MAX_CHUNK
-from agv_analysis.bags.records import MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, Index, has_shape, is_known
+from agv_analysis.bags.records import (
+    DATA_END,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_INDEX,
+    RECORD,
+    SUMMARY_OFFSET,
+    Index,
+    fields_end,
+    is_known,
+)
 
 _AHEAD = 2**18
 """Bytes that are read at least: a chunk with its message indexes, as a rule."""
@@ -24,6 +35,11 @@ _MAX_CANDIDATES = 200_000
 _INDEX_HEAD = struct.Struct("<BQHI")
 """Opcode, length, channel and bytes of entries of a message index, the commonest record outside of chunks."""
 
+_MOST_EXTRA = 1024
+"""Bytes after its last field that a record may have when it is searched for."""
+
+_OF_FIXED_LENGTH = (FOOTER, SUMMARY_OFFSET, DATA_END)
+
 _RECORD_START = re.compile(rb"(?=[\x01-\x0f].{5}\x00{3})", re.DOTALL)
 """A known opcode, and a length below 2^40."""
 
@@ -34,6 +50,8 @@ class Record(NamedTuple):
     position: int
     opcode: int
     content: bytes
+    extra: int = 0
+    """How many of its bytes follow the last field that is known here."""
 
     @property
     def end(self) -> int:
@@ -99,9 +117,13 @@ class Source:
             raise DamagedError("a record of kind 0, which there is not")
         if length > MAX_CHUNK + _WINDOW:
             raise DamagedError(f"a record of {length} bytes, too long to be read")
-        content = self.read(position + RECORD.size, length)
-        if is_known(opcode) and not has_shape(opcode, length, lambda at, count: content[at : at + count]):
-            raise DamagedError("a record whose lengths contradict each other")
+        begin = position + RECORD.size
+        content = self.read(begin, length)
+        if is_known(opcode):
+            end = fields_end(opcode, length, lambda at, count: content[at : at + count])
+            if end is None or (end < length and not self._is_extended(begin + end, begin + length)):
+                raise DamagedError("a record whose lengths contradict each other")
+            return Record(position, opcode, content, length - end)
         return Record(position, opcode, content)
 
     def index(self, position: int) -> tuple[Index, int] | None:
@@ -115,18 +137,51 @@ class Source:
             return None
         return Index(channel, np.frombuffer(self.read(begin, size), "<i8")[1::2]), begin + size
 
-    def is_record(self, position: int, depth: int = 3) -> bool:
-        """Is there a record of a known kind at `position`? A message must be followed by others, or by the end."""
+    def is_record(self, position: int, depth: int = 3, is_search: bool = True) -> bool:
+        """Is there a record of a known kind at `position`? A message must be followed by another one, or by the end.
+
+        `is_search`: nothing says that a record should be there, so that one with many bytes after its last field, or of
+        a kind without fields of variable length, does not count.
+        """
         try:
             opcode, length = self.head(position)
         except DamagedError:
             return False
         begin = position + RECORD.size
-        if not is_known(opcode) or not has_shape(opcode, length, lambda at, count: self.read(begin + at, count)):
+        if not is_known(opcode):
             return False
-        if opcode != MESSAGE or depth == 0:
+        end = fields_end(opcode, length, lambda at, count: self.read(begin + at, count))
+        if end is None:
+            return False
+        if is_search and end < length and (length - end > _MOST_EXTRA or opcode in _OF_FIXED_LENGTH):
+            return False
+        if depth == 0 or (end == length and opcode != MESSAGE):
             return True
-        return self.is_end(begin + length) or self.is_record(begin + length, depth - 1)
+        if opcode == MESSAGE:
+            return self.is_followed(begin + length, depth - 1)
+        return self._is_extended(begin + end, begin + length, depth - 1)
+
+    def is_followed(self, position: int, depth: int = 3) -> bool:
+        """Is at `position` what may follow a record: the end, or another one, of a kind that is not known, too?"""
+        if self.is_end(position) or self.is_record(position, depth, is_search=False):
+            return True
+        try:
+            opcode, length = self.head(position)
+        except DamagedError:
+            return False
+        is_new = opcode != 0 and not is_known(opcode)
+        return is_new and (depth == 0 or self.is_followed(position + RECORD.size + length, depth - 1))
+
+    def _is_extended(self, fields_end: int, end: int, depth: int = 3) -> bool:
+        """Is what lies between a record's last field and its end something that a newer version has added?
+
+        Another record must follow; what lies there must not be records that a wrong length has swallowed.
+        """
+        if not self.is_followed(end, depth):
+            return False
+        while fields_end < end and self.is_record(fields_end, depth=0):
+            fields_end += RECORD.size + self.head(fields_end)[1]
+        return fields_end != end
 
     def is_end(self, position: int) -> bool:
         """Is this the end of the file's records?"""
