@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.findings import Findings
+from agv_analysis.bags.json_table import JsonTable
 from agv_analysis.bags.known_types import Definition, KnownTypes
 from agv_analysis.bags.message_batch import NO_DEFINITION, Batch
 from agv_analysis.bags.message_compression import inflated_batches
@@ -137,11 +138,11 @@ class _Reading:
         self._borrowed: dict[str, str] = {}
         self._first: dict[str, Schema] = {}
         self._forms: dict[tuple[str, str, bytes], Struct] = {}
-        self._tables: dict[str, Table] = {}
+        self._tables: dict[str, Table | JsonTable] = {}
         self._refusals: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
         self._metadata: dict[str, dict[str, str]] = {}
-        self._latest: dict[int, tuple[Channel, Schema | None, Table | None]] = {}
+        self._latest: dict[int, tuple[Channel, Schema | None, Table | JsonTable | None]] = {}
 
     def is_wanted(self, channel: Channel) -> bool:
         """Are the messages of this channel to become an array?"""
@@ -171,7 +172,7 @@ class _Reading:
         self._metadata.update(storage.metadata)
         self._findings.merge(storage.findings)
 
-    def _table(self, storage: Storage, channel: Channel, batch: Batch | None) -> Table | None:
+    def _table(self, storage: Storage, channel: Channel, batch: Batch | None) -> Table | JsonTable | None:
         """The table of a channel's topic, None if its messages cannot be decoded; `batch`: some of them."""
         topic = channel.topic
         schema = storage.schemas.get(channel.schema_id) or self._by_metadata(topic)
@@ -179,8 +180,10 @@ class _Reading:
         if topic in self._refusals or (batch is None and topic in self._tables):
             return self._tables.get(topic)
         try:
+            if channel.encoding == "json":
+                return self._tables.setdefault(topic, JsonTable())
             if channel.encoding != "cdr":
-                raise UndecodableError(f"its messages are encoded as {channel.encoding!r}; only cdr is read")
+                raise UndecodableError(f"its messages are encoded as {channel.encoding!r}; cdr and json are read")
             if schema is None:
                 raise UndecodableError(NO_DEFINITION)
             definition = self._define(storage, channel, schema, batch)
@@ -229,13 +232,18 @@ class _Reading:
 
     def bag(self, path: Path) -> Bag:
         """The bag, once all files have been read."""
-        arrays = {topic: table.rows for topic, table in sorted(self._tables.items())}
+        arrays: dict[str, NDArray[np.void]] = {}
+        for topic, table in sorted(self._tables.items()):
+            try:
+                arrays[topic] = table.rows
+            except UndecodableError as error:
+                self._refuse(topic, error)
         self._findings.merge(self._contents.findings)
         self._compare_with_metadata()
         for topic, table in sorted(self._tables.items()):
-            if table.layouts.misfits:
-                what = f"{topic}: message that is not of its type, left out ({table.layouts.first_misfit})"
-                self._findings.add(what, table.layouts.misfits, is_loss=True)
+            if table.misfits:
+                what = f"{topic}: message that is not of its type, left out ({table.first_misfit})"
+                self._findings.add(what, table.misfits, is_loss=True)
         unclear = [topic for topic in arrays if not self._tables[topic].is_orderly]
         with ThreadPoolExecutor(_THREADS, "bag") as pool:
             for found in pool.map(check_times, unclear, map(arrays.__getitem__, unclear)):

@@ -55,12 +55,12 @@ class KnownTypes:
         Raises BagError if it does not.
         """
         self._folder = folder
-        self._files: dict[str, Path] = {}
+        self._files: dict[str, list[Path]] = {}
         if folder is None:
             return
         for file in sorted(folder.rglob("*")):
             if file.suffix in _ENDINGS and file.is_file():
-                self._files.setdefault(_name_of(file), file)
+                self._files.setdefault(_name_of(file), []).append(file)
         if not self._files:
             raise BagError(f"{folder}: no definitions: there is no .msg, .idl or .srv file in it or in its folders")
 
@@ -117,8 +117,8 @@ class KnownTypes:
         short = rest.rpartition("/")[2]
         part = "msg" if rest.startswith("msg/") or "/" not in rest else rest.partition("/")[0]
         for name in (f"{package}/{part}/{short}", f"/{short}"):
-            if name in self._files:
-                return _text_of(self._files[name], f"{package}/{part}/{short}")
+            if files := self._files.get(name):
+                return _one_text(files, f"{package}/{part}/{short}")
         return None
 
 
@@ -128,6 +128,16 @@ def _name_of(file: Path) -> str:
     if folder.name in ("msg", "srv"):
         return f"{folder.parent.resolve().name}/{folder.name}/{file.stem}"
     return f"/{file.stem}"
+
+
+def _one_text(files: list[Path], kind: str) -> str:
+    """What files say of one type: built workspaces hold each definition several times."""
+    plain = [file for file in files if file.suffix != ".idl"] or files
+    texts = {_text_of(file, kind): file for file in plain}
+    if len(texts) > 1:
+        one, other, *_ = texts.values()
+        raise UndecodableError(f"{NO_DEFINITION}, and {one} and {other} give different ones")
+    return next(iter(texts))
 
 
 def _text_of(file: Path, kind: str) -> str:

@@ -30,6 +30,15 @@ _MAX_ROOM = 2**30
 """Most bytes that are set aside for messages which are merely expected."""
 
 
+def refuse_padding(needed: int, message_bytes: int, rows: int) -> None:
+    """Raise UndecodableError if an array would take `needed` bytes, out of all proportion to its messages."""
+    if needed > max(_PADDING_FREE, _PADDING_FACTOR * message_bytes):
+        raise UndecodableError(
+            f"its strings or sequences differ so much in length that {rows} messages would take "
+            f"{needed / 2**20:.0f} MiB as an array"
+        )
+
+
 @dataclass
 class _Column:
     """What is known of a column so far."""
@@ -106,6 +115,16 @@ class Table:
         """The messages so far, one row each."""
         size = self._dtype.itemsize
         return self._store[: self._count * size].view(self._dtype)
+
+    @property
+    def misfits(self) -> int:
+        """Messages that are not of the topic's type."""
+        return self.layouts.misfits
+
+    @property
+    def first_misfit(self) -> str:
+        """Why the first of them is not."""
+        return self.layouts.first_misfit
 
     @property
     def is_orderly(self) -> bool:
@@ -205,12 +224,7 @@ class Table:
 
     def _move(self, dtype: np.dtype[np.void], rows: int, room: int) -> None:
         """Move the rows to a new store for `rows` rows, or for `room` if that is more and not too much."""
-        needed = rows * dtype.itemsize
-        if needed > max(_PADDING_FREE, _PADDING_FACTOR * self._message_bytes):
-            raise UndecodableError(
-                f"its strings or sequences differ so much in length that {rows} messages would take "
-                f"{needed / 2**20:.0f} MiB as an array"
-            )
+        refuse_padding(rows * dtype.itemsize, self._message_bytes, rows)
         old = self.rows
         self._capacity = max(rows, min(room, _MAX_ROOM // dtype.itemsize))
         self._store = np.zeros(self._capacity * dtype.itemsize, np.uint8)  # what pads a row is zero, too

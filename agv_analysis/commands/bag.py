@@ -26,10 +26,17 @@ def command() -> None:
     """
 
 
+_DEFINITIONS = click.option(
+    "--definitions", type=click.Path(path_type=Path, exists=True, file_okay=False), metavar="DIR",
+    help="Folder with the .msg, .idl or .srv files of types that BAG does not define, as a workspace's share or src.",
+)  # fmt: skip
+
+
 @command.command("info")
 @click.argument("bag", type=click.Path(path_type=Path))
+@_DEFINITIONS
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
-def info(bag: Path, json_file: Path | None) -> None:
+def info(bag: Path, definitions: Path | None, json_file: Path | None) -> None:
     """Show what BAG holds, and everything that is wrong with it.
 
     Reads and decodes every message. The exit status is 1 only if nothing can be read.
@@ -38,12 +45,13 @@ def info(bag: Path, json_file: Path | None) -> None:
     Examples:
       agv-ncs bag info bags/first
       agv-ncs bag info someone_elses.mcap --json info.json
+      agv-ncs bag info custom_types --definitions ~/ws/install
     """
     from agv_analysis.bags import read_bag
     from agv_analysis.bags.bag_summary import describe
 
     with _bar(bag, "reading") as progress:
-        content = read_bag(bag, progress=progress)
+        content = read_bag(bag, progress=progress, definitions=definitions)
     summary = describe(content)
     for line in summary.lines():
         click.echo(line)
@@ -57,8 +65,9 @@ def info(bag: Path, json_file: Path | None) -> None:
 @click.option("--parquet", "form", flag_value="parquet", help="One Parquet file for each topic, in the directory OUT.")
 @click.option("--npz", "form", flag_value="npz", help="One file OUT of numpy arrays.")
 @click.option("--topic", "topics", multiple=True, help="Only this topic. May be repeated.")
+@_DEFINITIONS
 @click.option("--out", "-o", type=click.Path(path_type=Path), help="Where to; by default beside BAG.")
-def export(bag: Path, form: str | None, topics: tuple[str, ...], out: Path | None) -> None:
+def export(bag: Path, form: str | None, topics: tuple[str, ...], definitions: Path | None, out: Path | None) -> None:
     """Write the messages of BAG for other programs: one row a message, one column a value.
 
     \b
@@ -70,19 +79,19 @@ def export(bag: Path, form: str | None, topics: tuple[str, ...], out: Path | Non
 
     if form is None:
         raise click.UsageError(f"choose a format: {', '.join(f'--{name}' for name in EXPORTS)}")
-    content = _read(bag, topics)
+    content = _read(bag, topics, definitions)
     where = out or bag.with_name(f"{bag.name}_{form}" if form != "npz" else f"{bag.name}.npz")
     for path in EXPORTS[form](content, where):
         click.echo(path)
     _warn(content.problems, content.is_complete)
 
 
-def _read(bag: Path, topics: tuple[str, ...]) -> Bag:
+def _read(bag: Path, topics: tuple[str, ...], definitions: Path | None) -> Bag:
     """The topics that are asked for, each of which must be there and decodable; all that are, if none is."""
     from agv_analysis.bags import read_bag
 
     with _bar(bag, "reading") as progress:
-        content = read_bag(bag, topics or None, progress)
+        content = read_bag(bag, topics or None, progress, definitions)
     for topic in topics:
         content[topic]
     return content
@@ -91,7 +100,8 @@ def _read(bag: Path, topics: tuple[str, ...]) -> Bag:
 @command.command("recover")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
-def recover(bag: Path, out: Path) -> None:
+@_DEFINITIONS
+def recover(bag: Path, out: Path, definitions: Path | None) -> None:
     """Write every intact message of BAG to a clean bag OUT, and report what is missing.
 
     OUT becomes an MCAP file if its name ends in .mcap, else a rosbag2 directory.
@@ -103,7 +113,7 @@ def recover(bag: Path, out: Path) -> None:
     from agv_analysis.bags.recover import recover as recover_bag
 
     with _bar(bag, "copying") as progress:
-        recovery = recover_bag(bag, out, progress)
+        recovery = recover_bag(bag, out, progress, definitions)
     for topic, count in recovery.counts.items():
         click.echo(f"{topic}: {count} messages")
     click.echo(f"{out}: {sum(recovery.counts.values())} messages")

@@ -88,7 +88,9 @@ def test_the_true_reason_why_a_database_is_not_decoded(tmp_path: Path, make_data
     bag = read_bag(make_database(tmp_path / "a.db3", part=event))
     assert any("/add/_service_event: topic that cannot be decoded: the bag does not" in text for text in bag.problems)
     bag = read_bag(make_database(tmp_path / "b.db3", form="protobuf"))
-    with pytest.raises(BagError, match="/point: cannot be decoded: its messages are encoded as 'protobuf'; only cdr"):
+    with pytest.raises(
+        BagError, match="/point: cannot be decoded: its messages are encoded as 'protobuf'; cdr and json"
+    ):
         bag["/point"]
     assert len(bag.payloads("/point")) == 7
 

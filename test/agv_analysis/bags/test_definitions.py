@@ -1,0 +1,337 @@
+"""Types that a bag does not define, definitions in IDL, service events, and messages in JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from agv_analysis.bags import Bag, BagError, read_bag
+from agv_analysis.bags.recover import recover
+from agv_analysis.cli import main
+
+RANGE = "sensor_msgs/msg/Range"
+HUMBLE, JAZZY = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS2_JAZZY)
+"""In Iron `variance` was added to Range."""
+
+
+def write(
+    path: Path, kind: str, payloads: list[bytes], schema: tuple[str, bytes] = ("ros2msg", b""), form: str = "cdr",
+    topic: str = "/t", about: dict[str, str] | None = None, distro: str = "",
+) -> Path:  # fmt: skip
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="test")
+        channel = writer.register_channel(topic, form, writer.register_schema(kind, *schema), about or {})
+        for i, payload in enumerate(payloads):
+            writer.add_message(channel, i, payload, i)
+        if distro:
+            writer.add_metadata("rosbag2", {"serialized_metadata": f"version: 9\nros_distro: {distro}\n"})
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def ranges(store: Any) -> list[bytes]:
+    types = store.types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](1, 2), "sonar")
+    extra = (0.25,) if store is JAZZY else ()
+    return [
+        bytes(store.serialize_cdr(types[RANGE](header, 1, 0.5, 0.1, 4.0, float(i), *extra), RANGE)) for i in range(3)
+    ]
+
+
+def borrowed(bag: Bag) -> list[str]:
+    return [problem for problem in bag.problems if "definition is not in the bag" in problem]
+
+
+@pytest.mark.parametrize(
+    ("store", "distro", "source"),
+    [
+        (HUMBLE, "humble", "ROS 2 humble"), (JAZZY, "jazzy", "ROS 2 jazzy"), (HUMBLE, "", "ROS 2 dashing to humble"),
+        (JAZZY, "", "ROS 2 iron to lyrical"), (JAZZY, "rolling", "ROS 2 iron to lyrical"),
+    ],
+)  # fmt: skip
+def test_the_distribution_that_the_bag_names_or_that_fits_gives_the_definition(
+    tmp_path: Path, store: Any, distro: str, source: str
+) -> None:
+    bag = read_bag(write(tmp_path / "a.mcap", RANGE, ranges(store), distro=distro))
+    assert bag["/t"]["range"].tolist() == [0.0, 1.0, 2.0]
+    assert bag["/t"]["header.frame_id"].tolist() == [b"sonar"] * 3
+    assert ("variance" in (bag["/t"].dtype.names or ())) == (store is JAZZY)
+    assert borrowed(bag) == [f"/t: topic whose definition is not in the bag, that of {source} used: 1"]
+    assert bag.is_complete
+
+
+def test_a_named_distribution_that_does_not_fit_decodes_nothing(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", RANGE, ranges(JAZZY), distro="humble")
+    with pytest.raises(BagError, match="the bag does not hold the definition of its type"):
+        read_bag(path)["/t"]
+    assert recover(path, tmp_path / "out.mcap").counts == {"/t": 3}
+    assert read_bag(tmp_path / "out.mcap").payloads("/t") == ranges(JAZZY)
+
+
+def test_the_recorded_hash_decides_before_the_distribution(tmp_path: Path) -> None:
+    about = {"topic_type_hash": JAZZY.hash_rihs01(RANGE)}
+    bag = read_bag(write(tmp_path / "a.mcap", RANGE, ranges(JAZZY), about=about))
+    assert bag["/t"]["variance"].tolist() == [0.25] * 3
+
+
+def test_a_recovered_bag_holds_the_definition_that_described_its_messages(tmp_path: Path) -> None:
+    recovery = recover(write(tmp_path / "a.mcap", RANGE, ranges(HUMBLE)), tmp_path / "out.mcap")
+    said = "/t: topic whose definition is not in the bag, that of ROS 2 dashing to humble written: 1"
+    assert said in recovery.problems
+    bag = read_bag(tmp_path / "out.mcap")
+    assert bag.problems == ()
+    assert bag["/t"]["range"].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_a_type_without_members_needs_no_definition(tmp_path: Path) -> None:
+    for kind in ("std_msgs/msg/Empty", "my_msgs/msg/Ping"):
+        bag = read_bag(write(tmp_path / "a.mcap", kind, [b"\0\1\0\0\0"] * 2))
+        assert len(bag["/t"]) == 2
+        assert bag.problems == ()
+
+
+# -- a folder of definitions ------------------------------------------------------------------------------------------
+
+WHEEL_MSG = "std_msgs/Header header\nSide side\ngeometry_msgs/Point[] contacts\nfloat32[2] force\n"
+SIDE_MSG = "uint8 LEFT=0\nuint8 value\nstring name\n"
+WHEEL_IDL = """
+#include "std_msgs/msg/Header.idl"
+module my_msgs { module msg {
+  typedef float float__2[2];
+  struct Wheel {
+    std_msgs::msg::Header header;
+    my_msgs::msg::Side side;
+    @verbatim (language="comment", text= "where it touches")
+    sequence<geometry_msgs::msg::Point> contacts;
+    @unit (value="N")
+    float__2 force;
+  };
+}; };
+"""
+SIDE_IDL = """
+module my_msgs { module msg {
+  module Side_Constants { const uint8 LEFT = 0; };
+  struct Side { uint8 value; string name; };
+}; };
+"""
+WHEEL = "my_msgs/msg/Wheel"
+
+
+def wheels() -> list[bytes]:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register({**get_types_from_msg(WHEEL_MSG, WHEEL), **get_types_from_msg(SIDE_MSG, "my_msgs/msg/Side")})
+    types = store.types
+    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](1, 2), "base")
+    point = types["geometry_msgs/msg/Point"]
+    return [
+        bytes(
+            store.serialize_cdr(
+                types[WHEEL](
+                    header, types["my_msgs/msg/Side"](i, "l" * i), [point(1.0, 2.0, float(i))] * i,
+                    np.array([0.5, i], np.float32),
+                ),
+                WHEEL,
+            )
+        )
+        for i in range(3)
+    ]  # fmt: skip
+
+
+def assert_wheels(bag: Bag) -> None:
+    rows = bag["/t"]
+    assert rows["side.value"].tolist() == [0, 1, 2]
+    assert rows["side.name"].tolist() == [b"", b"l", b"ll"]
+    assert rows["len(contacts)"].tolist() == [0, 1, 2]
+    assert rows["contacts.z"][2].tolist() == [2.0, 2.0]
+    assert rows["force"].tolist() == [[0.5, 0.0], [0.5, 1.0], [0.5, 2.0]]
+
+
+FOLDERS = {
+    "share of a workspace": ("install/share/my_msgs/msg/Wheel.msg", "install/share/my_msgs/msg/Side.msg"),
+    "package": ("my_msgs/msg/Wheel.msg", "my_msgs/msg/Side.msg"),
+    "loose files": ("Wheel.msg", "Side.msg"),
+    "IDL": ("my_msgs/msg/Wheel.idl", "my_msgs/msg/Side.idl"),
+    "both": ("my_msgs/msg/Wheel.idl", "my_msgs/msg/Side.msg"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_a_folder_of_definitions(tmp_path: Path, kind: str) -> None:
+    folder = tmp_path / "ws"
+    for name in FOLDERS[kind]:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        texts = (WHEEL_MSG, SIDE_MSG) if name.endswith(".msg") else (WHEEL_IDL, SIDE_IDL)
+        (folder / name).write_text(texts["Side" in name])
+    path = write(tmp_path / "a.mcap", WHEEL, wheels())
+    with pytest.raises(BagError, match="does not hold the definition"):
+        read_bag(path)["/t"]
+    bag = read_bag(path, definitions=folder)
+    assert_wheels(bag)
+    assert borrowed(bag) == [f"/t: topic whose definition is not in the bag, that of {folder} used: 1"]
+    arguments = ["bag", "recover", str(path), str(tmp_path / "out.mcap"), "--definitions", str(folder)]
+    assert CliRunner().invoke(main, arguments, catch_exceptions=False).exit_code == 0
+    assert_wheels(read_bag(tmp_path / "out.mcap"))
+
+
+def test_a_folder_with_two_definitions_of_one_type_is_not_believed(tmp_path: Path) -> None:
+    for place, text in (("src", SIDE_MSG), ("install", "string name\nuint8 value\n")):
+        folder = tmp_path / "ws" / place / "my_msgs" / "msg"
+        folder.mkdir(parents=True)
+        (folder / "Side.msg").write_text(text)
+    path = write(tmp_path / "a.mcap", "my_msgs/msg/Side", [b"\0\1\0\0\7\0\0\0\1\0\0\0\0"])
+    with pytest.raises(BagError, match=r"install/my_msgs/msg/Side.msg and .*src/my_msgs/msg/Side.msg give different"):
+        read_bag(path, definitions=tmp_path / "ws")["/t"]
+
+
+def test_a_folder_without_definitions_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", WHEEL, wheels())
+    with pytest.raises(BagError, match=r"no definitions: there is no \.msg, \.idl or \.srv file in it"):
+        read_bag(path, definitions=tmp_path)
+
+
+@pytest.mark.parametrize(
+    "kind", ["../../etc/passwd", "os/msg/path", "a/b/c/d", "", "my_msgs", "/msg/X", "x/srv/_Event"]
+)
+def test_names_of_types_that_are_none_are_looked_up_nowhere(tmp_path: Path, kind: str) -> None:
+    bag = read_bag(write(tmp_path / "a.mcap", kind, wheels()))
+    assert any(problem.startswith("/t: topic that cannot be decoded") for problem in bag.problems)
+
+
+# -- definitions in IDL within the bag --------------------------------------------------------------------------------
+
+
+def test_definitions_in_idl(tmp_path: Path) -> None:
+    """As rosbag2 writes them: each behind a line of `=` and one with its name, in any order."""
+    time = "module builtin_interfaces { module msg { struct Time { long sec; unsigned long nanosec; }; }; };"
+    header = """#include "builtin_interfaces/msg/Time.idl"
+    module std_msgs { module msg { struct Header { builtin_interfaces::msg::Time stamp; string frame_id; }; }; };"""
+    point = "module geometry_msgs { module msg { struct Point { double x; double y; double z; }; }; };"
+    parts = {
+        WHEEL: WHEEL_IDL, "std_msgs/msg/Header": header, "builtin_interfaces/msg/Time": time,
+        "my_msgs/msg/Side": SIDE_IDL, "geometry_msgs/msg/Point": point,
+    }  # fmt: skip
+    text = "".join(f"{'=' * 80}\nIDL: {name}\n{part}\n" for name, part in parts.items())
+    bag = read_bag(write(tmp_path / "a.mcap", WHEEL, wheels(), ("ros2idl", text.encode())))
+    assert_wheels(bag)
+    assert bag.problems == ()
+
+
+@pytest.mark.parametrize("text", ["struct {", "module a { module msg { struct B { double x; }; }; };"])
+def test_idl_that_does_not_describe_the_type_is_refused(tmp_path: Path, text: str) -> None:
+    bag = read_bag(write(tmp_path / "a.mcap", WHEEL, wheels(), ("ros2idl", text.encode())))
+    with pytest.raises(BagError, match="its definition in IDL"):
+        bag["/t"]
+
+
+# -- service events ---------------------------------------------------------------------------------------------------
+
+EVENT = "my_srvs/srv/Add_Event"
+
+
+def events() -> list[bytes]:
+    """By rosbags, which knows no services, as messages of the same members."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    request_type, response_type, event_type = (f"my_srvs/msg/{name}" for name in ("Request", "Response", "Event"))
+    event = "service_msgs/ServiceEventInfo info\nRequest[<=1] request\nResponse[<=1] response"
+    for kind, text in ((request_type, "int64 a\nstring why"), (response_type, "int64 sum"), (event_type, event)):
+        store.register(get_types_from_msg(text, kind))
+    types = store.types
+    found = []
+    for i in range(4):
+        gid = np.arange(16, dtype=np.uint8)
+        info = types["service_msgs/msg/ServiceEventInfo"](i, types["builtin_interfaces/msg/Time"](5, i), gid, 100 + i)
+        request = [types[request_type](i, "because")] if i < 2 else []
+        response = [types[response_type](-i)] if i >= 2 else []
+        found.append(bytes(store.serialize_cdr(types[event_type](info, request, response), event_type)))
+    return found
+
+
+@pytest.mark.parametrize("form", ["mcap", "sqlite3"])
+def test_service_events(tmp_path: Path, make_database: Callable[..., Path], form: str) -> None:
+    """The recorder of Jazzy leaves their definition empty."""
+    folder = tmp_path / "my_srvs" / "srv"
+    folder.mkdir(parents=True)
+    (folder / "Add.srv").write_text("int64 a\nstring why\n---\nint64 sum\n")
+    if form == "mcap":
+        path = write(tmp_path / "a.mcap", EVENT, events(), topic="/add/_service_event")
+    else:
+        part = [("/add/_service_event", EVENT, i, data) for i, data in enumerate(events())]
+        path = make_database(tmp_path / "a.db3", part=part)
+    rows = read_bag(path, definitions=tmp_path)["/add/_service_event"]
+    assert rows["info.event_type"].tolist() == [0, 1, 2, 3]
+    assert rows["info.sequence_number"].tolist() == [100, 101, 102, 103]
+    assert rows["len(request)"].tolist() == [1, 1, 0, 0]
+    assert rows["request.why"][:2].tolist() == [[b"because"], [b"because"]]
+    assert rows["response.sum"][2:].tolist() == [[-2], [-3]]
+
+
+# -- JSON -------------------------------------------------------------------------------------------------------------
+
+
+def read_json(tmp_path: Path, *contents: Any) -> Bag:
+    payloads = [content if isinstance(content, bytes) else json.dumps(content).encode() for content in contents]
+    return read_bag(write(tmp_path / "a.mcap", "Pose", payloads, ("jsonschema", b"{}"), "json"))
+
+
+def test_messages_in_json(tmp_path: Path) -> None:
+    bag = read_json(
+        tmp_path,
+        {"pose": {"x": 1, "y": 0.5}, "name": "one", "ok": True, "id": 2**60, "scan": [1.0, 2.0], "tags": [{"a": 1}]},
+        {"pose": {"x": 2, "y": 2}, "name": "three €", "ok": False, "id": -7, "scan": [], "tags": [{"a": 2}, {"a": 3}]},
+    )
+    rows = bag["/t"]
+    assert rows["pose.x"].tolist() == [1, 2]
+    assert rows["pose.y"].tolist() == [0.5, 2.0]
+    assert rows["name"].tolist() == [b"one", "three €".encode()]
+    assert rows["ok"].tolist() == [True, False]
+    assert rows["id"].tolist() == [2**60, -7]
+    assert rows["len(scan)"].tolist() == [2, 0]
+    assert rows["scan"][0].tolist() == [1.0, 2.0]
+    assert np.isnan(rows["scan"][1]).all()
+    assert rows["tags.a"].tolist() == [[1, 0], [2, 3]]
+    assert rows["log_time_ns"].tolist() == [0, 1]
+    assert bag.problems == ()
+
+
+def test_json_of_unlike_messages(tmp_path: Path) -> None:
+    bag = read_json(tmp_path, {"a": 1, "b": None, "c": "x"}, {"b": 2.5, "c": 3}, b"[1]", b"{", {"a.b": 4})
+    rows = bag["/t"]
+    assert np.array_equal(rows["a"], [1.0, np.nan, np.nan], equal_nan=True)
+    assert np.array_equal(rows["b"], [np.nan, 2.5, np.nan], equal_nan=True)
+    assert rows["c"].tolist() == [b"x", b"3", b""]
+    assert rows['"a.b"'].tolist()[2] == 4.0
+    assert "/t: message that is not of its type, left out (no JSON object: a list where an object is expected): 2" in (
+        bag.problems
+    )
+    assert not bag.is_complete
+
+
+@pytest.mark.parametrize(
+    ("contents", "why"),
+    [
+        (({"a": [1]}, {"a": 1}), "a is a list in some of its messages and not in others"),
+        (({"a": 2**64}, {}), "a has whole numbers of more than 64 bits"),
+        (({"a": 2**60 + 1}, {}), "a has numbers beyond 2"),
+        (({"a": 2**60 + 1}, {"a": 0.5}), "a has fractions and whole numbers beyond 2"),
+    ],
+)
+def test_json_that_would_give_wrong_numbers_is_refused(tmp_path: Path, contents: tuple[Any, ...], why: str) -> None:
+    bag = read_json(tmp_path, *contents)
+    with pytest.raises(BagError, match=why):
+        bag["/t"]
+    assert len(bag.payloads("/t")) == 2
+
+
+def test_json_with_one_long_list_does_not_take_all_memory(tmp_path: Path) -> None:
+    bag = read_json(tmp_path, *[{"a": [0.5]}] * 3000, {"a": [0.5] * 20_000})
+    with pytest.raises(BagError, match="its strings or sequences differ so much in length"):
+        bag["/t"]
