@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,13 @@ from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.json_table import JsonTable
-from agv_analysis.bags.known_types import Definition, KnownTypes
+from agv_analysis.bags.known_types import Definition, KnownTypes, is_undefined
+from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.bags.message_batch import NO_DEFINITION, Batch
 from agv_analysis.bags.message_compression import inflated_batches
 from agv_analysis.bags.message_table import Table
 from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
-from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
+from agv_analysis.bags.rosbag2 import Contents, locate, open_files
 from agv_analysis.bags.schema import Struct, parse_schema, short_name
 from agv_analysis.bags.storage import LARGE, Storage
 from agv_analysis.bags.type_hash import contradicts
@@ -45,6 +47,21 @@ class Topic:
     """The definition of its type, and of the types in it."""
     offered_qos: str
     """The publishers' QoS as the recorder wrote it (YAML), empty if it did not."""
+    encoding: str
+    """How its messages are serialised: "cdr" for those of ROS 2."""
+    definition: str
+    """Where the definition of its type is from: "the bag", "ROS 2 humble", a folder; empty if it is missing."""
+
+
+class Attached(NamedTuple):
+    """What is known of a file that was put into a recording; `recover` copies its content."""
+
+    name: str
+    media_type: str
+    size: int
+    """[B]."""
+    log_time_ns: int
+    create_time_ns: int
 
 
 @dataclass(frozen=True)
@@ -65,9 +82,23 @@ class Bag:
     """Everything that was lost, could not be checked, or is not as it should be; in words, with counts."""
     is_complete: bool
     """Is nothing known to be missing?"""
+    attachments: tuple[Attached, ...]
+    """MCAP's Attachment records, in file order."""
+    distro: str
+    """ROS distribution that recorded the bag, empty if it does not say."""
     arrays: dict[str, NDArray[np.void]] = field(repr=False)
     """The topics that were asked for and could be decoded; `bag[topic]` says of the others why they are not here."""
     _refusals: dict[str, str] = field(repr=False)
+    _log_times: dict[str, NDArray[np.int64]] = field(repr=False)
+
+    def log_times(self, topic: str) -> NDArray[np.int64]:
+        """Log times [ns] of a topic's messages, in file order, if it was asked for, whether or not it can be decoded.
+
+        Empty if it was not; without those messages that are not of their type.
+        """
+        if topic in self.arrays:
+            return np.ascontiguousarray(self.arrays[topic][LOG_TIME])
+        return self._log_times.get(topic, np.zeros(0, np.int64))
 
     def __getitem__(self, topic: str) -> NDArray[np.void]:
         """Messages of a topic. Raises BagError if it is not in the bag, was not asked for, or cannot be decoded."""
@@ -142,11 +173,14 @@ class _Reading:
         self._refusals: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
         self._metadata: dict[str, dict[str, str]] = {}
+        self._attachments: list[Attached] = []
+        self._distro = ""
+        self._undecoded: dict[str, list[NDArray[np.int64]]] = {}
         self._latest: dict[int, tuple[Channel, Schema | None, Table | JsonTable | None]] = {}
 
     def is_wanted(self, channel: Channel) -> bool:
-        """Are the messages of this channel to become an array?"""
-        return (self._wanted is None or channel.topic in self._wanted) and channel.topic not in self._refusals
+        """Are the messages of this channel asked for? Of those that cannot be decoded, the times are kept."""
+        return self._wanted is None or channel.topic in self._wanted
 
     def take(self, storage: Storage, channel: Channel, batch: Batch) -> None:
         """Add a batch to the table of its topic; a topic that cannot be decoded is given up."""
@@ -156,11 +190,13 @@ class _Reading:
             latest = self._latest[channel.id] = channel, schema, self._table(storage, channel, batch)
         table = latest[2]
         if table is None:
+            self._undecoded.setdefault(channel.topic, []).append(batch.log_times)
             return
         try:
             table.append(batch)
         except UndecodableError as error:
             self._refuse(channel.topic, error)
+            self._undecoded.setdefault(channel.topic, []).append(batch.log_times)
 
     def finish(self, storage: Storage) -> None:
         """Take over what is known of a file after its last message."""
@@ -170,6 +206,11 @@ class _Reading:
             if self.is_wanted(channel):
                 self._table(storage, channel, None)
         self._metadata.update(storage.metadata)
+        self._distro = self._distro or storage.distro or self._contents.distro
+        self._attachments += [
+            Attached(item.name, item.media_type, item.size, item.log_time, item.create_time)
+            for item in storage.attachments
+        ]
         self._findings.merge(storage.findings)
 
     def _table(self, storage: Storage, channel: Channel, batch: Batch | None) -> Table | JsonTable | None:
@@ -227,7 +268,9 @@ class _Reading:
 
     def _refuse(self, topic: str, error: UndecodableError) -> None:
         self._refusals[topic] = f"cannot be decoded: {error}"
-        self._tables.pop(topic, None)
+        table = self._tables.pop(topic, None)
+        if isinstance(table, Table) and len(table.rows):
+            self._undecoded.setdefault(topic, []).append(table.rows[LOG_TIME].copy())
         self._latest.clear()
 
     def bag(self, path: Path) -> Bag:
@@ -239,7 +282,7 @@ class _Reading:
             except UndecodableError as error:
                 self._refuse(topic, error)
         self._findings.merge(self._contents.findings)
-        self._compare_with_metadata()
+        self._contents.compare({name: self._topic(name) for name in self._known}, self._findings)
         for topic, table in sorted(self._tables.items()):
             if table.misfits:
                 what = f"{topic}: message that is not of its type, left out ({table.first_misfit})"
@@ -255,40 +298,17 @@ class _Reading:
             self._findings.add(f"{topic}: topic that {reason}")
         topics = {name: self._topic(name) for name in sorted(self._known)}
         findings = self._findings
-        return Bag(path, topics, self._metadata, findings.texts(), not findings.is_loss, arrays, self._refusals)
-
-    def _compare_with_metadata(self) -> None:
-        counts, types = self._contents.counts, self._contents.types
-        renamed = self._renamed()
-        for topic, expected in counts.items():
-            found = self._counts[renamed.get(topic, topic)]
-            if topic in renamed:
-                self._findings.add(f"{renamed[topic]}: topic that {METADATA} calls {topic}")
-            if found < expected:
-                what = f"{topic}: message that {METADATA} counts and that is not there"
-                self._findings.add(what, expected - found, is_loss=True)
-            elif found > expected:
-                self._findings.add(f"{topic}: message more than {METADATA} counts", found - expected)
-            _, schema = self._known.get(topic, (None, None))
-            if schema is not None and types.get(topic) and types[topic] != schema.name:
-                self._findings.add(f"{topic}: topic of type {schema.name} that {METADATA} calls {types[topic]}")
-
-    def _renamed(self) -> dict[str, str]:
-        """Topics of metadata.yaml that are not in the bag, with those of equal type and count that are not in it."""
-        counts, types = self._contents.counts, self._contents.types
-        others = {name: schema for name, (_, schema) in self._known.items() if name not in counts}
-        found: dict[str, str] = {}
-        for topic in counts.keys() - self._known.keys():
-            twins = [
-                name
-                for name, schema in others.items()
-                if self._counts[name] == counts[topic] and (schema is None or schema.name == types.get(topic))
-            ]
-            if len(twins) == 1 and twins[0] not in found.values():
-                found[topic] = twins[0]
-        return found
+        times = {topic: np.concatenate(parts) for topic, parts in self._undecoded.items()}
+        return Bag(
+            path, topics, self._metadata, findings.texts(), not findings.is_loss, tuple(self._attachments),
+            self._distro, arrays, self._refusals, times,
+        )  # fmt: skip
 
     def _topic(self, name: str) -> Topic:
         channel, schema = self._known[name]
         kind, text = (schema.name, schema.text) if schema else ("", "")
-        return Topic(name, kind, self._counts[name], text, channel.metadata.get(QOS, ""))
+        has_own = schema is not None and not is_undefined(schema)
+        source = self._borrowed.get(name, "the bag" if has_own or name in self._tables else "")
+        return Topic(
+            name, kind, self._counts[name], text, channel.metadata.get(QOS, ""), channel.encoding, source,
+        )  # fmt: skip

@@ -376,8 +376,8 @@ class McapFile:
         attachment, crc, covered = parse_attachment(record.content)
         if crc and crc32(record.content[:covered]) != crc:
             self.findings.add("attachment that does not match its CRC, left out", at=record.position, is_loss=True)
-        elif self._keep_all:
-            self.attachments.append(attachment)
+        else:
+            self.attachments.append(attachment if self._keep_all else attachment._replace(content=b""))
 
     def _define(self, definition: Definition, is_proven: bool) -> None:
         if not is_known(definition.opcode):

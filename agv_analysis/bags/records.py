@@ -197,6 +197,8 @@ class Attachment(NamedTuple):
     media_type: str
     log_time: int
     create_time: int
+    size: int
+    """Bytes of its content."""
     content: bytes
 
 
@@ -238,7 +240,8 @@ def parse_attachment(content: bytes) -> tuple[Attachment, int, int]:
     """Attachment record, its CRC (0: none), and how many bytes of the record that covers. Raises DamagedError."""
     cursor = Cursor(content)
     log_time, create_time = cursor.number(8), cursor.number(8)
-    attachment = Attachment(cursor.text(), cursor.text(), log_time, create_time, cursor.block(8))
+    name, media_type, data = cursor.text(), cursor.text(), cursor.block(8)
+    attachment = Attachment(name, media_type, log_time, create_time, len(data), data)
     covered = cursor.position
     return attachment, cursor.number(4), covered
 

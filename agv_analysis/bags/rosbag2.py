@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import yaml
 
@@ -43,6 +43,16 @@ _MAX_METADATA = 2**26
 """Most bytes of a metadata.yaml; that of a bag with a thousand topics and files has one million."""
 
 
+class _Found(Protocol):
+    """A topic as it was found in the files."""
+
+    @property
+    def type(self) -> str: ...
+
+    @property
+    def count(self) -> int: ...
+
+
 @dataclass
 class Contents:
     """Where the messages of a bag are, and what its metadata.yaml says of them."""
@@ -55,6 +65,36 @@ class Contents:
     distro: str = ""
     """ROS distribution of the recorder."""
     findings: Findings = field(default_factory=Findings)
+
+    def compare(self, topics: Mapping[str, _Found], findings: Findings) -> None:
+        """Report where metadata.yaml and the files, in which these topics were found, disagree."""
+        renamed = self._renamed(topics)
+        for topic, expected in self.counts.items():
+            found = topics.get(renamed.get(topic, topic))
+            count = found.count if found else 0
+            if topic in renamed:
+                findings.add(f"{renamed[topic]}: topic that {METADATA} calls {topic}")
+            if count < expected:
+                what = f"{topic}: message that {METADATA} counts and that is not there"
+                findings.add(what, expected - count, is_loss=True)
+            elif count > expected:
+                findings.add(f"{topic}: message more than {METADATA} counts", count - expected)
+            if found and found.type and self.types.get(topic) not in ("", found.type):
+                findings.add(f"{topic}: topic of type {found.type} that {METADATA} calls {self.types.get(topic)}")
+
+    def _renamed(self, topics: Mapping[str, _Found]) -> dict[str, str]:
+        """Topics of metadata.yaml that are not in the bag, with those of equal type and count that are not in it."""
+        found: dict[str, str] = {}
+        for topic in self.counts.keys() - topics.keys():
+            twins = [
+                name
+                for name, other in topics.items()
+                if (other.count, other.type or self.types[topic]) == (self.counts[topic], self.types[topic])
+                and name not in self.counts
+            ]
+            if len(twins) == 1 and twins[0] not in found.values():
+                found[topic] = twins[0]
+        return found
 
 
 def locate(path: Path) -> Contents:

@@ -30,6 +30,7 @@ class Storage(Protocol):
     metadata: list[tuple[str, dict[str, str]]]
     """Metadata records: name and content; a name may be there more than once."""
     attachments: list[Attachment]
+    """With their content if the storage was opened to keep all, else without."""
     counts: Counter[int]
     """Messages found by channel."""
     position: int

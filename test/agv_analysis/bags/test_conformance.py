@@ -212,7 +212,7 @@ def test_each_variant_is_read_as_the_library_reads_it(tmp_path: Path, name: str)
         assert [(c.topic, c.encoding, c.metadata) for c in file.channels.values()] == [
             (c.topic, c.message_encoding, c.metadata) for c in channels[:1]
         ], variant
-        assert [tuple(a) for a in file.attachments] == [
+        assert [(*a[:4], a.content) for a in file.attachments] == [
             (a.name, a.media_type, a.log_time, a.create_time, a.data) for a in attachments
         ], variant
         assert file.metadata == [(m.name, m.metadata) for m in metadata], variant
