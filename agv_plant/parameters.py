@@ -11,6 +11,7 @@ from agv_plant.channels.coverage_hole import NO_HOLES
 from agv_plant.channels.coverage_hole import rows_of as holes
 from agv_plant.channels.position_dependent import EVERYWHERE, kind_of
 from agv_plant.channels.registry import CHANNELS, SHARED, TRACE
+from agv_plant.channels.timed_trace import has_delays
 from agv_plant.channels.trace import ENDS
 from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.radio.schedule import Entry, parse_schedule
@@ -195,12 +196,22 @@ class ChannelParameters:
     )
     trace_file: str = parameter(
         "",
-        "trace: CSV file with a row a slot, column lost (0, 1) or verdict (delivered, lost); or JSON, a list so called",
+        "trace: CSV file with a column lost (0, 1) or verdict (delivered, lost), or uplink_lost and downlink_lost; "
+        "with a column time [s] it is played by time, and may have delays [s], else a row is a slot; or JSON with "
+        "lists so called",
     )
     trace_end: str = parameter(
         "repeat",
         "trace: what follows its last slot; repeat: the first, hold: no more losses, stop: an error",
         choices=ENDS,
+    )
+    trace_window: float = parameter(
+        0.0,
+        "trace: a run with seed s begins s - 1 times this behind the trace's beginning, so that seeds meet different "
+        "parts of a long one; 0: all begin with it",
+        unit="s",
+        low=0.0,
+        high=1e9,
     )
     correlation: float = parameter(
         0.0,
@@ -264,8 +275,10 @@ class ChannelParameters:
 
     @property
     def delays(self) -> bool:
-        """May a message arrive later than in its slot?"""
-        return self.delay + self.jitter > 0.0 or any(entry.name in ("delay", "jitter") for entry in self.entries)
+        """May a message arrive later than in its slot? Raises TraceError for a trace that cannot be read."""
+        of_parameters = self.delay + self.jitter > 0.0
+        of_schedule = any(entry.name in ("delay", "jitter") for entry in self.entries)
+        return of_parameters or of_schedule or (self.model == TRACE and has_delays(self.trace_file))
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,9 @@ def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
             "each of its steps: set plant.clock=realtime"
         )
     steps = scenario.plant.duration / scenario.plant.ts
-    for channel in (scenario.relay.uplink, scenario.relay.downlink):
-        check_length(channel, steps)
+    relay = scenario.relay
+    for link, channel in (("uplink", relay.uplink), ("downlink", relay.downlink)):
+        check_length(channel, relay.seed, link, steps, relay.ts)
     met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": PATIENCE if recorded else scenario.plant.stop_timeout}
     nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
     if scenario.error_detector.hears_commands and not scenario.plant.plan_steps:

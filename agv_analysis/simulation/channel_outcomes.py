@@ -22,7 +22,7 @@ from agv_plant.channels.model import GOOD
 from agv_plant.channels.position_dependent import kind_of
 from agv_plant.channels.registry import MODELS, SHARED, TRACE, find_model
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.channel import Channel, delay_draws, draws, losses, own_stream
+from agv_plant.radio.channel import Channel, MeasuredSlots, delay_draws, draws, own_stream
 from agv_plant.radio.channel_setup import Segment, levels_of, segments_of, spatial_table_of
 from agv_plant.radio.delay import NEVER, delays_of, soonest
 from agv_plant.radio.schedule import is_scripted
@@ -73,10 +73,10 @@ class ChannelRealisation:
     def _compute(self, channel: ChannelParameters, stream: str, states: States | None = None) -> Outcomes:
         """Outcomes, and into `states` the states that decided."""
         states = np.empty(self._steps, dtype=np.int64) if states is None else states
-        if channel.model == TRACE:  # nothing to compute
-            return losses(channel, self._seed, stream, self._steps, self._ts)
         lost = np.zeros(self._steps, dtype=np.bool_)
-        if channel.model == SHARED:
+        if channel.model == TRACE:
+            lost[:] = MeasuredSlots(channel, self._seed, stream, self._ts).rows(0, self._steps)[:, 0]
+        elif channel.model == SHARED:
             self._serve(channel, stream, lost)
         elif channel.model != "perfect" and not channel.is_placed:
             try:
@@ -129,7 +129,7 @@ def link_inputs(
     for segment, end in _segments(channel, steps, ts):
         now = segment.channel
         levels[segment.first : end] = levels_of(now)
-        if now.delay + now.jitter > 0.0:
+        if channel.delays:
             waits[segment.first : end] = _slots_under_way(segment, end, seed, stream, ts)
     waits[waits == NEVER] = 0  # lost, as said
     spatial_table = np.array(
@@ -142,10 +142,13 @@ def link_inputs(
 
 def _slots_under_way(segment: Segment, end: int, seed: int, stream: str, ts: float) -> NDArray[np.int64]:
     """Slots until the messages of a segment's slots arrive, or the first of their copies, NEVER if none does."""
-    now = segment.channel
-    random = delay_draws(now, seed, stream, segment.first, end - segment.first)
+    now, count = segment.channel, end - segment.first
+    random = delay_draws(now, seed, stream, segment.first, count)
+    delay = np.full(count, now.delay)
+    if now.model == TRACE:
+        delay += MeasuredSlots(now, seed, stream, ts).rows(segment.first, count)[:, 1]
     found: NDArray[np.int64] = compiled(_waits)(
-        numbers(random), segment.first, now.delay, now.jitter, now.duplicate, now.lifetime, ts
+        numbers(random), segment.first, numbers(delay), now.jitter, now.duplicate, now.lifetime, ts
     )
     return found
 
@@ -184,11 +187,11 @@ def _script(lost: Outcomes, first: int, end: int, at: float, length: float, peri
 
 
 def _waits(
-    random: Any, first: int, delay: float, jitter: float, duplicate: float, lifetime: float, ts: float
+    random: Any, first: int, delay: Any, jitter: float, duplicate: float, lifetime: float, ts: float
 ) -> NDArray[np.int64]:
     waits = np.empty(len(random), dtype=np.int64)
     for i in range(len(random)):
         u_delay, u_twice, u_copy, _ = random[i]
-        message, copy = delays_of(first + i, u_delay, u_twice, u_copy, delay, jitter, duplicate, lifetime, ts)
+        message, copy = delays_of(first + i, u_delay, u_twice, u_copy, delay[i], jitter, duplicate, lifetime, ts)
         waits[i] = soonest(message, copy)
     return waits

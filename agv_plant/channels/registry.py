@@ -10,7 +10,8 @@ GROUP = "agv_ncs.channels"
 
 MODELS: dict[str, Model] = own_parts(
     "agv_plant.channels", "perfect",
-    besides=("coverage_hole", "model", "position_dependent", "rayleigh", "registry", "trace"), name="model",
+    besides=("coverage_hole", "model", "position_dependent", "rayleigh", "registry", "timed_trace", "trace"),
+    name="model",
 )  # fmt: skip
 """Those of this package that see neither the place nor other vehicles."""
 

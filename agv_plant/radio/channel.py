@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from agv_plant.channels.model import GOOD, Model
 from agv_plant.channels.position_dependent import NOWHERE, kind_of, outcome_at
 from agv_plant.channels.registry import SHARED, TRACE, ChannelError, find_model
-from agv_plant.channels.trace import TraceError, load_trace, trace
+from agv_plant.channels.timed_trace import Trace, read_trace, start_of
+from agv_plant.channels.trace import TraceError
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel_setup import UPLINK, Segment, levels_of, segments_of, spatial_table_of
 from agv_plant.radio.delay import EXPIRED, delays_of
@@ -62,6 +63,31 @@ class SlotOutcome(NamedTuple):
     """Of the channel [dB], NaN if it has none."""
 
 
+class MeasuredSlots:
+    """What a measured channel's file says of each slot. Raises TraceError if it cannot be used."""
+
+    def __init__(self, parameters: ChannelParameters, seed: int, stream: str, ts: float) -> None:
+        self._file, self._end, self._ts = parameters.trace_file, parameters.trace_end, ts
+        self._trace: Trace = read_trace(self._file, stream)
+        self._start = start_of(self._trace, seed, parameters.trace_window, ts)
+
+    def rows(self, first: int, count: int) -> NDArray[np.float64]:
+        """Lost (0 or 1) and time under way [s] of the slots first .. first + count - 1, shape (count, 2).
+
+        Raises TraceError for a slot behind the end of a trace that may not be outrun.
+        """
+        k = np.arange(first, first + count, dtype=np.int64)
+        try:
+            rows = self._trace.rows(k, self._ts, self._end, self._start)
+        except TraceError as error:
+            raise TraceError(f"{self._file}: {error}") from None
+        found = np.zeros((count, 2))
+        found[:, 0] = self._trace.lost[rows] & (rows >= 0)
+        if self._trace.delay is not None:
+            found[:, 1] = np.where(rows >= 0, self._trace.delay[rows], 0.0)
+        return found
+
+
 def _in_blocks(make: Callable[[int, int], NDArray[np.float64]]) -> InBlocks[list[float]]:
     return InBlocks(lambda first, count: make(first, count).tolist(), _BLOCK)
 
@@ -106,7 +132,8 @@ class Channel:
         measured = parameters.model == TRACE
         self._kind = kind_of(parameters.model)
         self._spatial_table = spatial_table_of(parameters, seed, stream) if parameters.is_placed else []
-        self._trace = load_trace(parameters.trace_file) if measured else ()
+        self._slots = MeasuredSlots(parameters, seed, stream, ts) if measured else None
+        self._measured: dict[int, tuple[float, float]] = {}
         self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
         self._random = _in_blocks(lambda first, count: draws(self.parameters, seed, stream, first, count))
         self._random_delays = _in_blocks(lambda first, count: delay_draws(self.parameters, seed, stream, first, count))
@@ -145,10 +172,11 @@ class Channel:
     def delays(self, k: int) -> tuple[float, float]:
         """Slots that the message of slot `k` is under way if it is not lost, and its copy; -1 for what never comes."""
         c = self._segment(k).channel
-        if c.delay + c.jitter + c.duplicate == 0.0:
+        delay = c.delay + (self._measured_at(k)[1] if self._slots is not None else 0.0)
+        if delay + c.jitter + c.duplicate == 0.0:
             return 0.0, -1.0
         u_delay, u_twice, u_copy, _ = self._random_delays.at(k)
-        return delays_of(k, u_delay, u_twice, u_copy, c.delay, c.jitter, c.duplicate, c.lifetime, self._ts)
+        return delays_of(k, u_delay, u_twice, u_copy, delay, c.jitter, c.duplicate, c.lifetime, self._ts)
 
     def _segment(self, k: int) -> Segment:
         if len(self._segments) == 1:
@@ -162,7 +190,7 @@ class Channel:
 
     def _by_slot(self, k: int) -> SlotOutcome:
         if self._model is None:
-            lost = self._measured(k)
+            lost = self._measured_at(k)[0] != 0.0
             return SlotOutcome(lost, TRACE if lost else "")
         if k < self._next - 1:
             self._next, self._state = 0, GOOD
@@ -178,17 +206,26 @@ class Channel:
             self._next += 1
         return self._last
 
-    def _measured(self, k: int) -> bool:
-        try:
-            return trace(k, self._trace, self.parameters.trace_end)
-        except TraceError as error:
-            raise TraceError(f"{self.parameters.trace_file}: {error}") from None
+    def _measured_at(self, k: int) -> tuple[float, float]:
+        """Lost (0 or 1) and time under way [s] of slot k; those around it are looked up with it.
+
+        Not those behind the end of a trace that may not be outrun: that it ends is said of the slot behind it.
+        """
+        assert self._slots is not None
+        if k not in self._measured:
+            first = k - k % _BLOCK
+            try:
+                rows = self._slots.rows(first, _BLOCK)
+            except TraceError:
+                first, rows = k, self._slots.rows(k, 1)
+            self._measured = {first + i: (row[0], row[1]) for i, row in enumerate(rows.tolist())}
+        return self._measured[k]
 
 
-def check_length(parameters: ChannelParameters, steps: float) -> None:
+def check_length(parameters: ChannelParameters, seed: int, stream: str, steps: float, ts: float) -> None:
     """Is a trace that may not be outrun long enough for a run of `steps`? Raises TraceError before the run if not."""
     if parameters.model == TRACE and math.isfinite(steps):
-        Channel(parameters, 0, "").lost(max(0, round(steps) - 1))
+        MeasuredSlots(parameters, seed, stream, ts).rows(max(0, round(steps) - 1), 1)
 
 
 def losses(
