@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 COMMANDS = (
-    "run", "analyse", "stability", "channel", "parameters", "simulate", "explore", "sweep", "bag", "replay",
+    "run", "analyse", "stability", "channel", "link", "parameters", "simulate", "explore", "sweep", "bag", "replay",
     "reproduce",
 )  # fmt: skip
 

@@ -1,0 +1,273 @@
+"""`agv-ncs link`: what somebody measured of a link, and what a loop does behind it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from agv_analysis.commands import write_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from agv_analysis.link.link_figures import DirectionFigures, LinkFigures, Spread
+    from agv_analysis.link.measurement import LossRates, Measurement, Reading, Setting
+    from agv_analysis.scenario import Scenario
+    from agv_analysis.stability.through_link import ThroughLink
+
+_LONG = 2**25
+"""Files of more bytes than this are read under a progress bar."""
+
+
+@click.command("link")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("params", type=click.Path(), required=False)
+@click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter of PARAMS.")
+@click.option("--format", "name", help="The format of FILE, if it cannot be told by what is in it.")
+@click.option("--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between packets [s], if unsaid.")
+@click.option("--column", "columns", multiple=True, metavar="ROLE=NAME", help="Which column of a table is what.")
+@click.option("--topic", default="", help="Which topic of a bag.")
+@click.option("--received", type=click.Path(path_type=Path), help="The capture at the other end, beside FILE.")
+@click.option(
+    "--rtt", type=click.Choice(["half", "up", "down"]), default="half", show_default=True,
+    help="Where only round trips are known: on which way packets and time were lost.",
+)  # fmt: skip
+@click.option("--trace", type=click.Path(path_type=Path), help="Write a file for the channel trace, with times.")
+@click.option("--picture", type=click.Path(path_type=Path), help="Draw the link to this file.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+def command(
+    file: Path, params: str | None, settings: tuple[str, ...], name: str | None, interval: float | None,
+    columns: tuple[str, ...], topic: str, received: Path | None, rtt: str, trace: Path | None, picture: Path | None,
+    json_file: Path | None,
+) -> None:  # fmt: skip
+    """Show what FILE says of a link: output of ping, irtt, owping, iperf3, a capture, a table, a bag, a line for netem.
+
+    With the params file PARAMS: what its loop does behind this very link, and behind the channel fitted to it.
+
+    \b
+    Examples:
+      agv-ncs link ping.txt --picture link.png
+      agv-ncs link irtt.json config/outages.yaml --json link.json
+      agv-ncs link capture.csv --column time=frame.time_epoch --column seq=icmp.seq --trace trace.csv
+    """
+    from rich.console import Console
+
+    from agv_analysis.link.formats.format import Options
+    from agv_analysis.link.measurement import LossRates, Setting
+    from agv_analysis.scenario import load_scenario
+
+    scenario = None if params is None else load_scenario(params, settings)
+    options = Options(interval, dict(map(_column, columns)), topic, received)
+    reading = _read(file, options, name or "")
+    console = Console(highlight=False)
+    if isinstance(reading, Setting):
+        found = _setting(console, reading, scenario)
+    elif isinstance(reading, LossRates):
+        found = _rates(console, reading)
+    else:
+        found = _measured(console, reading, scenario, rtt, trace, picture)
+    if json_file is not None:
+        write_json(json_file, found)
+    if isinstance(reading, LossRates) and (scenario is not None or trace is not None):
+        raise click.ClickException(reading.refusal)
+
+
+def _column(text: str) -> tuple[str, str]:
+    role, equals, name = text.partition("=")
+    if not equals:
+        raise click.ClickException(f"--column takes ROLE=NAME, as in time=frame.time_epoch; got {text!r}")
+    return role, name
+
+
+def _read(file: Path, options: Any, name: str) -> Reading:
+    """Read a file, a long one under a progress bar."""
+    from agv_analysis.commands.progress import step_bar
+    from agv_analysis.link.formats import read_link
+
+    if not file.is_file() or file.stat().st_size < _LONG:
+        return read_link(file, options, name)
+    from dataclasses import replace
+
+    with step_bar(100, "reading") as progress:
+        return read_link(file, replace(options, progress=lambda share: progress(round(100 * share))), name)
+
+
+def _setting(console: Console, found: Setting, scenario: Scenario | None) -> dict[str, Any]:
+    from dataclasses import replace
+
+    from agv_analysis.link.link_figures import setting_to_json
+
+    content = setting_to_json(found)
+    shown = ", ".join(f"{key} {value}" for key, value in content["channel"].items())
+    console.print(f"[bold]{found.source}[/]: a setting of netem, no measurement", soft_wrap=True)
+    console.print(f"Channel: {shown}", soft_wrap=True)
+    for sentence in found.differences:
+        console.print(f"[bold yellow]Not the same:[/] {sentence}.", soft_wrap=True)
+    if scenario is not None:
+        from agv_analysis.stability.through_link import through_channel
+
+        relay = replace(scenario.relay, uplink=found.channel)
+        with _busy("driving the loop ..."):
+            driven = through_channel(replace(scenario, relay=relay))
+        _print_driven(console, "through it as the uplink", driven)
+        content["loop"] = driven.to_json()
+    return content
+
+
+def _rates(console: Console, found: LossRates) -> dict[str, Any]:
+    from agv_analysis.link.link_figures import rate_of, rates_to_json
+
+    rate = rate_of(found)
+    console.print(
+        f"[bold]{found.source}[/]: {found.format}, {int(found.packets.sum())} packets in {len(found.packets)} "
+        f"intervals, {rate.value:.4%} lost (95 %: {rate.low:.4%} to {rate.high:.4%})",
+        soft_wrap=True,
+    )
+    for note in found.notes:
+        console.print(f"[bold yellow]Note:[/] {note}.", soft_wrap=True)
+    return rates_to_json(found)
+
+
+def _measured(
+    console: Console, measured: Measurement, scenario: Scenario | None, rtt: str, trace: Path | None,
+    picture: Path | None,
+) -> dict[str, Any]:  # fmt: skip
+    from rich.markup import escape
+    from rich.table import Table
+
+    from agv_analysis.link.link_figures import LinkFigures
+    from agv_analysis.link.measured_picture import draw_link
+    from agv_analysis.link.measured_trace import link_of_loop, write_trace
+
+    found, link = LinkFigures(measured), link_of_loop(measured, rtt)
+    console.print(
+        f"[bold]{escape(measured.source)}[/]: {measured.format}, {measured.packets} packets in {measured.span:.6g} s, "
+        f"one every {1e3 * measured.interval:.6g} ms",
+        soft_wrap=True,
+    )
+    table = Table(box=None, pad_edge=False)
+    for column in ("", *(name.replace("_", " ") for name in found.directions)):
+        table.add_column(column, style=None if column else "bold")
+    for row in rows(found):
+        table.add_row(*row)
+    console.print(table)
+    for sentence in sentences(found):
+        console.print(sentence, soft_wrap=True)
+    for note in (*measured.notes, *measured.malformed.sentences(), *link.notes):
+        console.print(f"[bold yellow]Note:[/] {escape(note)}.", soft_wrap=True)
+    content = {**found.to_json(), "assumed": list(link.notes)}
+    if trace is not None:
+        write_trace(trace, link)
+        console.print(f"trace:   {trace}")
+    if picture is not None:
+        draw_link(picture, found)
+        console.print(f"picture: {picture}")
+    if scenario is not None:
+        content["loop"] = _driven(console, scenario, found, link)
+    return content
+
+
+def _driven(console: Console, scenario: Scenario, found: LinkFigures, link: Any) -> dict[str, Any]:
+    """Drive a loop through a link, without its delays where it has some, and as fitted."""
+    from agv_analysis.stability.through_link import fitted_scenario, through_channel, through_trace, without_delays
+
+    content = {}
+    has_delays = any(delay is not None for delay in (link.uplink_delay, link.downlink_delay))
+    with tempfile.TemporaryDirectory() as folder, _busy("driving the loop through the link ..."):
+        driven = through_trace(scenario, link, Path(folder) / "link.csv")
+        alone = through_trace(scenario, without_delays(link), Path(folder) / "losses.csv") if has_delays else None
+        fitted = through_channel(fitted_scenario(scenario, found.fitted.fit, link, found.measured.interval))
+    _print_driven(console, "through this very link", driven)
+    content = driven.to_json()
+    if alone is not None:
+        _print_driven(console, "through its losses alone", alone)
+        content["losses_alone"] = alone.to_json()
+    _print_driven(console, "through the fitted channel", fitted)
+    content["fitted"] = fitted.to_json()
+    return content
+
+
+def _busy(what: str) -> Any:
+    from rich.console import Console
+
+    return Console(stderr=True).status(what)
+
+
+def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
+    import numpy as np
+    from rich.markup import escape
+
+    from agv_analysis.report.table import colour_of
+
+    verdict = driven.verdict
+    console.print(
+        f"The loop {how}: [bold {colour_of(verdict)}]{verdict.word}[/], {escape(verdict.reason)}", soft_wrap=True
+    )
+    largest, count = float(driven.deviations.max()), len(driven.deviations)
+    runs = f"a run of {driven.seconds:g} s" if count == 1 else f"{count} runs of {driven.seconds:g} s"
+    far = f"up to {largest:.3g} m from its reference" if np.isfinite(largest) else "without bound"
+    median = "" if count == 1 else f", the median run up to {float(np.median(driven.deviations)):.3g} m"
+    console.print(f"  Deviation in {runs}: {far}{median}", soft_wrap=True)
+
+
+def rows(found: LinkFigures) -> Iterator[tuple[str, ...]]:
+    """Name and value for each direction, as text; a dash where the file does not tell."""
+    directions = list(found.directions.values())
+    yield "Packets", *(str(len(direction.k)) for direction in directions)
+    yield "Loss rate (95 %)", *map(_rate, directions)
+    yield "Outages", *(str(len(direction.outages)) if direction.is_told else "-" for direction in directions)
+    yield "Longest outage", *(_ms(direction.longest) if direction.is_told else "-" for direction in directions)
+    for title, part in (("Delay", "delay"), ("Jitter", "jitter")):
+        spreads = [getattr(direction, part) for direction in directions]
+        if any(spread is not None for spread in spreads):
+            yield f"{title} p50, p95, p99, max", *map(_spread, spreads)
+
+
+def _rate(direction: DirectionFigures) -> str:
+    rate = direction.loss_rate
+    if rate is None:
+        return "-"
+    return f"{rate.value:.4%} ({rate.low:.4%} to {rate.high:.4%})"
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.6g} ms"
+
+
+def _spread(spread: Spread | None) -> str:
+    if spread is None:
+        return "-"
+    return ", ".join(f"{1e3 * value:.4g}" for value in (*spread.percentiles, spread.largest)) + " ms"
+
+
+def sentences(found: LinkFigures) -> Iterator[str]:
+    """What is said below the table: the fit, changes, what was not seen."""
+    direction = found.fitted
+    fit, measured = direction.fit, found.measured
+    name = direction.name.replace("_", " ")
+    if fit.model == "gilbert_elliott" and fit.p is not None and fit.r is not None:
+        p, r = fit.transitions.estimate
+        said = f"gilbert_elliott, p {p:.4g}, r {r:.4g} a packet: {fit.mean_burst:.3g} lost in a row on average"
+    else:
+        said = "perfect" if fit.model == "perfect" else f"bernoulli, p {fit.loss_rate.value:.4g} a packet"
+    goodness = fit.goodness.p_value
+    fits = "too little was lost to test it" if goodness is None else (
+        f"which describes the losses (p-value {goodness:.3g})" if fit.goodness.fits
+        else f"which does not describe the losses (p-value {goodness:.3g}): judge by the trace"
+    )  # fmt: skip
+    yield f"Fitted to the {name}: {said}, {fits}."
+    times = found.change_times
+    if times:
+        yield f"The link changed at {', '.join(f'{time:.4g} s' for time in times)}."
+    elif found.stationarity.p_value is None:
+        yield "Too short for its outages to say whether the link changed."
+    else:
+        yield f"The link did not change while it was measured (p-value {found.stationarity.p_value:.3g})."
+    if measured.duplicates or measured.reordered:
+        yield f"{measured.duplicates} packets came twice, {measured.reordered} after one that was sent later."
+    if measured.interval > 0.0:
+        yield f"Outages shorter than {_ms(measured.interval)} between two packets were not seen."

@@ -1,0 +1,132 @@
+"""A topic of a recording: stamps of the messages that came, and when they were logged.
+
+The edge's own slots, `edge/slot`, say of every message what became of it. Of any other topic with headers the stamps
+are on a grid of the median period, and a place of the grid without a message was lost; the delay is the time from the
+stamp to the log. Without stamps only the log times are known: a gap of more than one and a half periods is a loss.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.bags import Bag, read_bag
+from agv_analysis.bags.bag_errors import BagError
+from agv_analysis.link.formats.format import Format, Options
+from agv_analysis.link.measurement import (
+    LOST,
+    RECEIVED,
+    Measurement,
+    MeasurementError,
+    Numbered,
+    PacketOutcomes,
+    on_grid,
+)
+
+Times = NDArray[np.int64]
+
+_NS = 1e-9
+_SLOTS = ("edge/slot", "agv/slot")
+_MOST = 100_000_000
+"""Places of a grid: stamps that need more are on none."""
+
+
+def _matches(head: bytes, path: Path) -> bool:
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+    return head[:5] == b"\x89MCAP" or head[:15] == b"SQLite format 3"
+
+
+def _read(path: Path, options: Options) -> Measurement:
+    progress = options.progress
+    try:
+        bag = read_bag(path, progress=None if progress is None else lambda percent: progress(percent / 100.0))
+    except BagError as error:
+        raise MeasurementError(str(error)) from None
+    slots = [topic for name in _SLOTS for topic in bag.topics if topic.strip("/").endswith(name)]
+    if not options.topic and slots:
+        return _of_slots(bag, slots)
+    topics = [topic for topic in bag.topics if topic.strip("/") == options.topic.strip("/")]
+    if not topics:
+        known = ", ".join(f"{name} ({topic.count})" for name, topic in sorted(bag.topics.items()))
+        asked = f"has no topic {options.topic}" if options.topic else "is a recording: name a topic with --topic"
+        raise MeasurementError(f"{path}: {asked}; it has {known}")
+    return _of_topic(bag, topics[0])
+
+
+def _stamps(rows: NDArray[np.void], name: str = "header.stamp") -> Times | None:
+    """Stamps [ns], None if the messages have none."""
+    names = rows.dtype.names or ()
+    if f"{name}.sec" not in names:
+        return None
+    return np.asarray(rows[f"{name}.sec"].astype(np.int64) * 10**9 + rows[f"{name}.nanosec"].astype(np.int64))
+
+
+def _of_slots(bag: Bag, topics: list[str]) -> Measurement:
+    """Both links of this loop, by their slots."""
+    found = {}
+    for topic in topics:
+        rows = bag[topic]
+        stamps = _stamps(rows)
+        if stamps is None or not len(rows):
+            continue
+        stamps, at = np.unique(stamps, return_index=True)
+        lost = rows["source"][at] == b"lost"
+        delay = np.where(lost, np.nan, 0.0)
+        if topic.strip("/").endswith(_SLOTS[0]):
+            found["uplink"] = stamps, np.where(lost, LOST, RECEIVED).astype(np.int8), delay
+        else:
+            found["downlink"] = stamps, np.where(lost, LOST, RECEIVED).astype(np.int8), delay
+    if not found:
+        raise MeasurementError(f"{bag.path}: its slots are empty")
+    common = None
+    for stamps, _, _ in found.values():
+        common = stamps if common is None else np.intersect1d(common, stamps)
+    assert common is not None
+    if not len(common):
+        raise MeasurementError(f"{bag.path}: its slots of both links have no step in common")
+    ways = {name: PacketOutcomes(codes[np.searchsorted(stamps, common)]) for name, (stamps, codes, _) in found.items()}
+    step = int(np.median(np.diff(common))) if len(common) > 1 else 0
+    missing = 0 if step == 0 else round((int(common[-1]) - int(common[0])) / step) + 1 - len(common)
+    notes = (f"{missing} slots are missing from the recording",) if missing else ()
+    return Measurement(
+        source=str(bag.path), format="bag", sent=(common - common[0]) * _NS, uplink=ways.get("uplink"),
+        downlink=ways.get("downlink"), notes=(*notes, "outcomes are those that the relay recorded slot by slot"),
+    )  # fmt: skip
+
+
+def _of_topic(bag: Bag, topic: str) -> Measurement:
+    rows = bag[topic]
+    if len(rows) < 3:
+        raise MeasurementError(f"{bag.path}: {topic} has {len(rows)} messages: too few for a period")
+    logged, stamps = rows["log_time_ns"].astype(np.int64), _stamps(rows)
+    times = logged if stamps is None else stamps
+    notes = ["the messages have no stamps: the log times stand for them"] if stamps is None else []
+    period = int(np.median(np.diff(np.unique(times))))
+    if period <= 0 or (int(times.max()) - int(times.min())) // period > _MOST:
+        raise MeasurementError(f"{bag.path}: the stamps of {topic} are on no grid")
+    seq = _places(times, period)
+    delay = np.full(len(rows), np.nan) if stamps is None else np.asarray((logged - stamps) * _NS, dtype=np.float64)
+    if stamps is not None:
+        notes.append("delays are from stamp to log, and as good as the clocks of robot and recorder agree")
+    grid = on_grid(Numbered(seq, (delay,), (times - times.min()) * _NS), int(seq.min()), int(seq.max()), period * _NS)
+    return Measurement(
+        source=f"{bag.path}:{topic}", format="bag", sent=grid.sent,
+        uplink=PacketOutcomes(grid.outcome, None if stamps is None else grid.delays[0]), duplicates=grid.duplicates,
+        reordered=grid.reordered, notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _places(times: Times, period: int) -> Times:
+    """The place of each message on a grid, counted from one message to the next: a period is never known exactly."""
+    order = np.argsort(times, kind="stable")
+    gaps = np.diff(times[order])
+    steps = np.where(gaps == 0, 0, np.maximum(1, np.round(gaps / period))).astype(np.int64)
+    places = np.empty(len(times), dtype=np.int64)
+    places[order] = np.concatenate(([0], np.cumsum(steps)))
+    return places
+
+
+FORMAT = Format("bag", "topic of a ROS 2 bag", 5, _matches, _read)

@@ -1,0 +1,63 @@
+"""A packet-delivery trace of mahimahi: a line an opportunity for 1500 bytes to cross the link, in milliseconds.
+
+It is a capacity, not a series of packets. Read as a link it answers when a packet of the loop would arrive that is sent
+every so often and fits into one opportunity: at the next one. Nothing is lost, it waits; so an outage is a time without
+opportunities. At its end the trace begins again. Source: mm-link(1).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from agv_analysis.link.formats.format import Format, Options
+from agv_analysis.link.formats.rows import rows_of_words
+from agv_analysis.link.measurement import (
+    RECEIVED,
+    Malformed,
+    Measurement,
+    MeasurementError,
+    PacketOutcomes,
+    needs_packets,
+)
+
+_USUAL_INTERVAL = 0.005
+"""Time between the packets that are asked about [s]: the usual sampling period."""
+
+_MS = 1e-3
+
+
+def _matches(head: bytes, path: Path) -> bool:
+    lines = head.splitlines()
+    lines = lines[:-1] if len(lines) > 1 and len(head) >= 65536 else lines  # the last one may be cut
+    words = [line.strip() for line in lines if line.strip()]
+    if not words or not all(word.isdigit() for word in words):
+        return False
+    times = np.array([int(word) for word in words])
+    return bool(np.all(np.diff(times) >= 0)) and times[-1] > 1
+
+
+def _read(path: Path, options: Options) -> Measurement:
+    malformed = Malformed()
+    at = rows_of_words(path, 1, malformed, options.progress)[:, 0]
+    needs_packets(len(at), str(path), "line of an opportunity")
+    if np.any(np.diff(at) < 0.0) or not at[-1] > 0.0:
+        raise MeasurementError(f"{path}: times of a mahimahi trace must not decrease, and end behind 0")
+    interval = options.interval or _USUAL_INTERVAL
+    count = max(1, int(np.floor(at[-1] * _MS / interval + 1e-9)))
+    sent = np.arange(count, dtype=np.float64) * interval
+    opportunities = np.append(at, at[0] + at[-1]) * _MS
+    arrives = opportunities[np.searchsorted(opportunities, sent - 1e-9)]
+    note = (
+        f"opportunities, not packets: one of up to 1500 byte is asked about every {interval:g} s (--interval), which "
+        "waits for the next opportunity and is never lost"
+    )
+    return Measurement(
+        source=str(path), format="mahimahi", sent=sent,
+        uplink=PacketOutcomes(np.full(count, RECEIVED, dtype=np.int8), np.maximum(0.0, arrives - sent)),
+        malformed=malformed, notes=(note,),
+    )  # fmt: skip
+
+
+FORMAT = Format("mahimahi", "packet-delivery trace of mahimahi", 60, _matches, _read)

@@ -1,0 +1,85 @@
+"""Lines of words: which lines have so many, and the numbers that they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from agv_analysis.link.formats.text_columns import Block, Bytes, Places, Progress, blocks, cells, numbers_at
+from agv_analysis.link.measurement import Malformed
+from agv_analysis.run import Floats
+
+_BLANKS = np.frombuffer(b" \t\r\n", dtype=np.uint8)
+
+
+class Words(NamedTuple):
+    """The words of the lines of a block that have as many as wanted."""
+
+    lines: Places
+    """Shape (n,)."""
+    begins: Places
+    """Shape (n, words)."""
+    ends: Places
+
+
+def words_of(block: Block, count: int) -> Words:
+    """Lines with `count` words between blanks; an empty block has none."""
+    blank = np.isin(block.text, _BLANKS)
+    edges = np.diff(np.concatenate(([True], blank)).astype(np.int8))
+    begins = np.flatnonzero(edges == -1)
+    ends = np.flatnonzero(np.diff(np.concatenate((blank, [True])).astype(np.int8)) == 1) + 1
+    of_line = block.line_of(begins)
+    found = np.flatnonzero(np.bincount(of_line, minlength=len(block.starts)) == count)
+    kept = np.isin(of_line, found)
+    return Words(found, begins[kept].reshape(-1, count), ends[kept].reshape(-1, count))
+
+
+def floats_at(text: Bytes, begins: Places, ends: Places) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    """The numbers between these places, shape (n,), and whether each is one; NaN is, and so is nothing at all."""
+    negative = text[np.minimum(begins, len(text) - 1)] == ord("-")
+    numbers = numbers_at(text, begins + negative)
+    plain = (numbers.length == ends - begins - negative) & (numbers.length > 0)
+    values = np.where(negative, -numbers.values, numbers.values)
+    good = plain.copy()
+    others = np.flatnonzero(~plain)
+    if len(others):
+        words = cells(text, begins[others], ends[others])
+        empty = np.isin(np.char.lower(words), (b"", b"nan", b"na", b"null", b"-"))
+        values[others[empty]], good[others[empty]] = np.nan, True
+        for i, word in zip(others[~empty].tolist(), words[~empty].tolist(), strict=True):
+            try:
+                values[i], good[i] = float(word), True
+            except ValueError:
+                values[i] = np.nan
+    return values, good
+
+
+def lines_of_words(
+    path: Path, count: int, malformed: Malformed, progress: Progress | None = None
+) -> Iterator[tuple[Block, Words]]:
+    """Block by block the lines with `count` words; others that are not empty are malformed."""
+    for block in blocks(path, progress):
+        words = words_of(block, count)
+        for i in np.setdiff1d(np.arange(len(block.starts)), words.lines).tolist():
+            line = block.line(i)
+            if line.strip():
+                malformed.add(block.number + i, line)
+        yield block, words
+
+
+def rows_of_words(path: Path, count: int, malformed: Malformed, progress: Progress | None = None) -> Floats:
+    """A file of numbers between blanks as a table, shape (n, count)."""
+    parts = []
+    for block, words in lines_of_words(path, count, malformed, progress):
+        table = np.empty((len(words.lines), count))
+        good = np.ones(len(table), dtype=np.bool_)
+        for column in range(count):
+            table[:, column], fine = floats_at(block.text, words.begins[:, column], words.ends[:, column])
+            good &= fine
+        for i in np.flatnonzero(~good).tolist():
+            malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
+        parts.append(table[good])
+    return np.concatenate(parts) if parts else np.zeros((0, count))

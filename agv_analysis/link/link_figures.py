@@ -1,0 +1,269 @@
+"""What a measured link comes to: losses with intervals that know bursts, outages, delays, jitter, a fitted channel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.link.change_points import Stationarity, stationarity
+from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
+from agv_analysis.link.measurement import LossRates, Measurement, PacketOutcomes, Setting
+from agv_analysis.link.reception_intervals import Outcomes, Steps
+from agv_analysis.link.resampling import weights
+from agv_analysis.metrics.outages import outage_begins, outage_lengths
+from agv_analysis.run import Floats
+from agv_ros.parameters import as_dict
+
+PERCENTILES = (50, 95, 99)
+
+UPLINK, DOWNLINK, ROUND_TRIP = "uplink", "downlink", "round_trip"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Percentiles of times [s]; values that occurred."""
+
+    mean: float
+    percentiles: tuple[float, ...]
+    """At PERCENTILES."""
+    largest: float
+    count: int
+
+    @classmethod
+    def of(cls, values: Floats) -> Spread | None:
+        """Of values, NaN left out; None if nothing is left."""
+        values = values[~np.isnan(values)]
+        if not len(values):
+            return None
+        found = np.percentile(values, PERCENTILES, method="inverted_cdf").tolist()
+        return cls(float(values.mean()), tuple(found), float(values.max()), len(values))
+
+    def to_json(self) -> dict[str, float]:
+        """`mean_s`, `p50_s`, `p95_s`, `p99_s`, `max_s`."""
+        named = {f"p{q}_s": value for q, value in zip(PERCENTILES, self.percentiles, strict=True)}
+        return {"mean_s": self.mean, **named, "max_s": self.largest}
+
+
+class DirectionFigures:
+    """One direction, or the round trip, of packets sent at times [s], shape (N,)."""
+
+    def __init__(self, name: str, packets: PacketOutcomes, sent: Floats) -> None:
+        self.name = name
+        self._packets, self._sent = packets, sent
+        self.k: Steps = np.flatnonzero(packets.known)
+        """Numbers of the packets of which the outcome is known, shape (n,)."""
+        self.lost: Outcomes = packets.lost[self.k]
+
+    @property
+    def is_told(self) -> bool:
+        """Is it known of every packet that was sent this way what became of it?"""
+        return self._packets.is_told
+
+    @property
+    def count_lost(self) -> int:
+        """Packets that were lost for certain."""
+        return int(np.count_nonzero(self.lost))
+
+    @cached_property
+    def fit(self) -> ChannelFit:
+        """A channel fitted to the outcomes that are known."""
+        return fit_channel(self.lost, self.k)
+
+    @property
+    def loss_rate(self) -> Estimate | None:
+        """Share of the packets that was lost, None where the file cannot tell."""
+        return self.fit.loss_rate if self.is_told else None
+
+    @cached_property
+    def outages(self) -> Floats:
+        """How long each outage was [s]: from the first packet lost to the next one received, shape (m,).
+
+        One that is open at the end lasts at least to the end of its last packet's interval.
+        """
+        begins = outage_begins(self.k, self.lost)
+        last = begins + outage_lengths(self.k, self.lost) - 1
+        times = np.append(self._sent[self.k], self._sent[self.k[-1]] + self._interval if len(self.k) else 0.0)
+        return np.asarray(times[last + 1] - times[begins])
+
+    @property
+    def longest(self) -> float:
+        """The longest outage [s], 0 if there was none."""
+        return float(self.outages.max(initial=0.0))
+
+    @property
+    def _interval(self) -> float:
+        return float(np.median(np.diff(self._sent))) if len(self._sent) > 1 else 0.0
+
+    @cached_property
+    def delay(self) -> Spread | None:
+        """Time under way [s] of what was received; None if it is not known."""
+        return None if self._packets.delay is None else Spread.of(self._packets.delay)
+
+    @cached_property
+    def jitter(self) -> Spread | None:
+        """By how much the delay differs from one packet to the next, in absolute value [s]."""
+        delay = self._packets.delay
+        return None if delay is None else Spread.of(np.abs(np.diff(delay)))
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; `loss_rate` is null where the file cannot tell."""
+        return {
+            "packets": len(self.k),
+            "lost": self.count_lost,
+            "loss_rate": _estimate(self.loss_rate),
+            "outages": len(self.outages),
+            "outage_max_s": self.longest if self.is_told else None,
+            "outage_mean_s": float(self.outages.mean()) if self.is_told and len(self.outages) else None,
+            "delay": None if self.delay is None else self.delay.to_json(),
+            "jitter": None if self.jitter is None else self.jitter.to_json(),
+        }
+
+
+class LinkFigures:
+    """A measured link, packet by packet."""
+
+    def __init__(self, measured: Measurement) -> None:
+        self.measured = measured
+        named = {UPLINK: measured.uplink, DOWNLINK: measured.downlink, ROUND_TRIP: measured.round_trip}
+        self.directions = {
+            name: DirectionFigures(name, packets, measured.sent)
+            for name, packets in named.items()
+            if packets is not None
+        }
+        """By name, those that the file has."""
+
+    @property
+    def whole(self) -> DirectionFigures:
+        """The round trip, or the one direction that was measured."""
+        return next(self.directions[name] for name in (ROUND_TRIP, UPLINK, DOWNLINK) if name in self.directions)
+
+    @property
+    def fitted(self) -> DirectionFigures:
+        """What a channel is fitted to: the uplink, or where the file does not tell it, the round trip."""
+        uplink = self.directions.get(UPLINK)
+        return uplink if uplink is not None and uplink.is_told else self.whole
+
+    @cached_property
+    def stationarity(self) -> Stationarity:
+        """Did the link change while it was measured?"""
+        return stationarity(self.fitted.k, self.fitted.lost)
+
+    @property
+    def change_times(self) -> list[float]:
+        """When it changed, in seconds since the first packet."""
+        return [float(self.measured.sent[k]) for k in self.stationarity.change_points]
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; SI units; null where the file cannot tell."""
+        measured, whole, fit = self.measured, self.whole, self.fitted.fit
+        return {
+            "source": measured.source,
+            "format": measured.format,
+            "packets": measured.packets,
+            "lost": whole.count_lost,
+            "span_s": measured.span,
+            "interval_s": measured.interval,
+            **{
+                name: self.directions[name].to_json() if name in self.directions else _untold()
+                for name in (UPLINK, DOWNLINK, ROUND_TRIP)
+            },
+            "outage_max_s": whole.longest,
+            "delay": {"of": whole.name, **(dict.fromkeys(_KEYS) if whole.delay is None else whole.delay.to_json())},
+            "jitter": {"of": whole.name, **(dict.fromkeys(_KEYS) if whole.jitter is None else whole.jitter.to_json())},
+            "duplicates": measured.duplicates,
+            "reordered": measured.reordered,
+            "malformed": measured.malformed.count,
+            "fit": {"of": self.fitted.name, **_fit(fit)},
+            "stationarity": {**self.stationarity.to_json(), "change_times_s": self.change_times},
+            "notes": [*measured.notes, *measured.malformed.sentences()],
+        }
+
+
+_KEYS = ("mean_s", *(f"p{q}_s" for q in PERCENTILES), "max_s")
+
+
+def _untold() -> dict[str, Any]:
+    """Of a direction that the file does not tell."""
+    return dict.fromkeys(
+        ("packets", "lost", "loss_rate", "outages", "outage_max_s", "outage_mean_s", "delay", "jitter")
+    )
+
+
+def _estimate(found: Estimate | None) -> dict[str, float] | None:
+    return None if found is None else {"value": found.value, "low": found.low, "high": found.high}
+
+
+def _fit(fit: ChannelFit) -> dict[str, Any]:
+    """The fitted channel, with the names of the relay's parameters."""
+    return {
+        "model": fit.model,
+        "p": _estimate(fit.p),
+        "r": _estimate(fit.r),
+        "mean_burst": fit.mean_burst if math.isfinite(fit.mean_burst) else None,
+        "loss_rate": _estimate(fit.loss_rate),
+        "p_value": fit.p_value,
+        "goodness": fit.goodness.to_json(),
+    }
+
+
+def rate_of(found: LossRates) -> Estimate:
+    """Loss rate of counted losses; its interval by intervals drawn anew, since packets are not independent.
+
+    Of fewer than eight intervals there is none but [0, 1].
+    """
+    share = float(found.lost.sum() / found.packets.sum())
+    if len(found.packets) < 8:
+        return Estimate.about(share, 0.0, 1.0)
+    drawn = weights(len(found.packets))
+    rates = (drawn @ found.lost) / (drawn @ found.packets)
+    return Estimate.about(share, *(float(value) for value in np.quantile(rates, [0.0225, 0.9775])))
+
+
+def rates_to_json(found: LossRates) -> dict[str, Any]:
+    """The figures of counted losses by name, null for all that counts do not tell."""
+    rate = {"loss_rate": _estimate(rate_of(found)), "packets": int(found.packets.sum()), "lost": int(found.lost.sum())}
+    ways = (UPLINK, DOWNLINK) if found.is_uplink else (DOWNLINK, UPLINK)
+    return {
+        "source": found.source,
+        "format": found.format,
+        "packets": int(found.packets.sum()),
+        "lost": int(found.lost.sum()),
+        "span_s": float(found.end[-1] - found.begin[0]),
+        "interval_s": None,
+        ways[0]: {**_untold(), **rate},
+        ways[1]: _untold(),
+        ROUND_TRIP: _untold(),
+        "outage_max_s": None,
+        "delay": dict.fromkeys(("of", *_KEYS)),
+        "jitter": dict.fromkeys(("of", *_KEYS)),
+        "fit": None,
+        "stationarity": None,
+        "intervals": [
+            {"begin_s": begin, "end_s": end, "packets": packets, "lost": lost}
+            for begin, end, packets, lost in zip(
+                *(column.tolist() for column in (found.begin, found.end, found.packets, found.lost)), strict=True
+            )
+        ],
+        "no_trace_because": found.refusal,
+        "notes": list(found.notes),
+    }
+
+
+def setting_to_json(found: Setting) -> dict[str, Any]:
+    """What an emulator was set to, as a channel; nothing was measured."""
+    changed = ("model", "p", "r", "h", "k", "delay", "jitter", "duplicate")
+    values = as_dict(found.channel)
+    return {
+        "source": found.source,
+        "format": found.format,
+        "packets": None,
+        "span_s": None,
+        "interval_s": None,
+        "channel": {name: values[name] for name in changed},
+        "exact": not found.differences,
+        "differences": list(found.differences),
+    }

@@ -1,0 +1,122 @@
+"""A measurement as a link of the loop: which outcomes and delays either direction has, and a trace file of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from agv_analysis.link.measurement import LOST, RECEIVED, Measurement, PacketOutcomes
+from agv_analysis.run import Floats
+from agv_ros.errors import UserError
+
+UP, DOWN, HALF = "up", "down", "half"
+ROUND_TRIPS = (HALF, UP, DOWN)
+"""On which way a round trip lost its packet and its time, where that is all that is known.
+
+half: each way takes half the time, and the packet was lost on the way up; up, down: all of it on this way."""
+
+
+class LinkOfLoop(NamedTuple):
+    """What the loop's links did, packet by packet; shapes (N,)."""
+
+    time: Floats
+    """When each packet was sent [s]."""
+    uplink_lost: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    uplink_delay: Floats | None
+    """[s], NaN where unknown; None if it is not known at all."""
+    downlink_lost: np.ndarray[tuple[int], np.dtype[np.bool_]] | None
+    """None: nothing is known of the downlink, which is taken for perfect."""
+    downlink_delay: Floats | None
+    notes: tuple[str, ...]
+    """What was assumed."""
+
+
+def link_of_loop(measured: Measurement, rtt: str = HALF) -> LinkOfLoop:
+    """The links that a measurement is, `rtt` being one of ROUND_TRIPS.
+
+    The client of the measurement is taken for the AGV. What is not known of a packet is what was known before it.
+    """
+    up, down, both = measured.uplink, measured.downlink, measured.round_trip
+    notes: list[str] = []
+    is_told = up is not None and up.is_told and (down is None or down.is_told)
+    if is_told or both is None:
+        up_lost = None if up is None else _held(up)
+        down_lost = None if down is None else _held(down)
+        delays = _delay(up), _delay(down)
+        if up is None or down is None:
+            notes.append(
+                f"nothing is known of the {'uplink' if up is None else 'downlink'}, which is taken for perfect"
+            )
+    else:
+        lost = _held(both)
+        nothing = np.zeros(len(lost), dtype=np.bool_)
+        up_lost, down_lost = (nothing, lost) if rtt == DOWN else (lost, nothing)
+        delays = _delay(up), _delay(down)
+        said = "its losses are taken for the " + ("downlink's" if rtt == DOWN else "uplink's")
+        if delays[0] is None or delays[1] is None:
+            delays, share = _shares(both, rtt)
+            said += f", {share}"
+        notes.append(f"only the round trip is known: {said} (--rtt {rtt})")
+    found, early = [], 0
+    for delay in delays:
+        early += 0 if delay is None else int(np.count_nonzero(delay < 0.0))
+        found.append(None if delay is None else np.maximum(delay, 0.0))
+    if early:
+        notes.append(f"{early} delays are below 0, since the clocks do not agree: they count as 0")
+    nothing = np.zeros(measured.packets, dtype=np.bool_)
+    return LinkOfLoop(
+        _increasing(measured.sent), nothing if up_lost is None else up_lost, found[0], down_lost, found[1], tuple(notes)
+    )
+
+
+def _delay(packets: PacketOutcomes | None) -> Floats | None:
+    return None if packets is None or packets.delay is None or np.isnan(packets.delay).all() else packets.delay
+
+
+def _shares(both: PacketOutcomes, rtt: str) -> tuple[tuple[Floats | None, Floats | None], str]:
+    """Delays of both directions out of those of the round trip, and that in words."""
+    delay = _delay(both)
+    if delay is None:
+        return (None, None), "its delay is not known"
+    nothing = np.where(np.isnan(delay), np.nan, 0.0)
+    if rtt == HALF:
+        return (0.5 * delay, 0.5 * delay), "and each way takes half its time"
+    return ((delay, nothing), "and all its time") if rtt == UP else ((nothing, delay), "and all its time")
+
+
+def _held(packets: PacketOutcomes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Lost or not, shape (N,); where that is not known, what it was before, received at the beginning."""
+    known = packets.known
+    last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
+    outcome = np.where(last >= 0, packets.outcome[np.maximum(last, 0)], RECEIVED)
+    return np.asarray(outcome == LOST)
+
+
+def _increasing(sent: Floats) -> Floats:
+    """Times [s] that increase by a microsecond at least: stamps may be coarser than packets are apart."""
+    steps = np.maximum(np.diff(sent), 1e-6)
+    return np.concatenate(([0.0], np.cumsum(steps))) if np.any(np.diff(sent) < 1e-6) else sent - sent[0]
+
+
+def write_trace(path: Path, link: LinkOfLoop) -> None:
+    """Write a file for the channel `trace`, with times. Raises UserError if it cannot be written."""
+    columns: list[tuple[str, Floats]] = [("time", link.time), ("uplink_lost", link.uplink_lost.astype(np.float64))]
+    if link.uplink_delay is not None:
+        columns.append(("uplink_delay", np.where(link.uplink_lost, np.nan, link.uplink_delay)))
+    if link.downlink_lost is not None:
+        columns.append(("downlink_lost", link.downlink_lost.astype(np.float64)))
+        if link.downlink_delay is not None:
+            columns.append(("downlink_delay", np.where(link.downlink_lost, np.nan, link.downlink_delay)))
+    header = ",".join(name for name, _ in columns)
+    form = ",".join("%d" if name.endswith("_lost") else "%.9g" if name != "time" else "%.6f" for name, _ in columns)
+    try:
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(header + "\n")
+            table = np.stack([column for _, column in columns], axis=1)
+            for first in range(0, len(table), 65536):
+                rows = table[first : first + 65536].tolist()
+                file.write("\n".join([form % tuple(row) for row in rows]) + "\n")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None

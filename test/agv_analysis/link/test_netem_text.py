@@ -1,0 +1,134 @@
+"""Lines for netem as people write them, held to the kernel's own recursions, simulated here."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agv_analysis.link.formats import read_link
+from agv_analysis.link.markov_channel import chain_of
+from agv_analysis.link.measurement import MeasurementError, Setting
+from agv_analysis.link.netem import NetemError
+from agv_analysis.link.netem_text import correlated_loss, four_states, read_netem
+from agv_plant.parameters import ChannelParameters
+
+
+def read(line: str) -> tuple[ChannelParameters, tuple[str, ...]]:
+    return read_netem(line, ChannelParameters())
+
+
+def test_what_ours_can_is_exact() -> None:
+    for line in (
+        "loss 5%", "loss random 5%", "tc qdisc add dev eth0 root netem loss 5%", "netem limit 1000 loss 5% seed 42",
+        "qdisc netem 8001: dev eth0 root refcnt 2 limit 1000 loss 5%", "loss 5", "loss 5% 0% ecn",
+    ):  # fmt: skip
+        found, differences = read(line)
+        assert (found.model, found.p, differences) == ("bernoulli", 0.05, ()), line
+    for line in ("loss gemodel 1% 10% 70% 0.1%", "loss gemodel p 1% r 10% 1-h 70% 1-k 0.1%"):
+        found, differences = read(line)
+        assert (found.p, found.r, found.k, differences) == (0.01, 0.1, 0.999, ())
+        assert found.h == pytest.approx(0.3)
+    found, differences = read("loss state 2% 25%")
+    assert (found.model, found.p, found.r, differences) == ("gilbert_elliott", 0.02, 0.25, ())
+    found, differences = read("delay 20ms 5ms duplicate 1%")
+    assert (found.delay, found.jitter, found.duplicate, found.model) == (0.02, 0.005, 0.01, "perfect")
+    assert differences == ()
+    assert read("delay 1.5s")[0].delay == 1.5
+    assert read("delay 250usec")[0].delay == pytest.approx(250e-6)
+
+
+def test_what_ours_cannot_is_said() -> None:
+    line = "delay 20ms 5ms 25% distribution normal loss 5% 25% reorder 25% 50% gap 5 rate 1mbit corrupt 0.1%"
+    found, differences = read(line)
+    assert found.delay == 0.02
+    assert found.jitter == pytest.approx(0.005 * math.sqrt(3.0))  # the same standard deviation
+    for word in (
+        "correlated by 0.25",
+        "normal distribution",
+        "loss 0.05 with correlation",
+        "reorder",
+        "rate",
+        "corrupt",
+    ):
+        assert any(word in sentence for sentence in differences), word
+
+
+@pytest.mark.parametrize(("p", "rho"), [(0.3, 0.25), (0.1, 0.1), (0.5, 0.9)])
+def test_correlated_losses_are_those_of_the_kernel(p: float, rho: float) -> None:
+    u, x, lost = np.random.default_rng(1).random(100_000).tolist(), 0.5, []
+    for value in u:
+        x = value * (1.0 - rho) + rho * x
+        lost.append(x < p)
+    outcomes = np.array(lost)
+    rate, burst = correlated_loss(p, rho)
+    begins = np.count_nonzero(outcomes[1:] & ~outcomes[:-1])
+    assert outcomes.mean() == pytest.approx(rate, rel=0.05)
+    assert outcomes.sum() / begins == pytest.approx(burst, rel=0.05)
+    channel, differences = read(f"loss {p:%} {rho:%}")
+    chain = chain_of(channel)
+    assert chain is not None
+    assert [chain.loss_rate, chain.mean_burst] == pytest.approx([rate, burst])
+    assert len(differences) == 1
+
+
+def loss_4state(p13: float, p31: float, p32: float, p23: float, p14: float, count: int) -> list[bool]:
+    """Linux' loss_4state(), state by state: its names and its order."""
+    state, lost = 1, []
+    for rnd in np.random.default_rng(2).random(count).tolist():
+        is_lost = False
+        if state == 1:
+            if rnd < p14:
+                state, is_lost = 4, True
+            elif rnd < p13 + p14:
+                state, is_lost = 3, True
+        elif state == 2:
+            if rnd < p23:
+                state, is_lost = 3, True
+        elif state == 3:
+            if rnd < p32:
+                state = 2
+            elif rnd < p31 + p32:
+                state = 1
+            else:
+                is_lost = True
+        else:
+            state = 1
+        lost.append(is_lost)
+    return lost
+
+
+def test_four_states_are_those_of_the_kernel() -> None:
+    figures = (0.05, 0.2, 0.3, 0.6, 0.02)
+    outcomes, chain = np.array(loss_4state(*figures, 100_000)), four_states(*figures)
+    begins = np.count_nonzero(outcomes[1:] & ~outcomes[:-1])
+    assert outcomes.mean() == pytest.approx(chain.loss_rate, rel=0.03)
+    assert outcomes.sum() / begins == pytest.approx(chain.mean_burst, rel=0.03)
+    channel, differences = read("loss state " + " ".join(f"{figure:%}" for figure in figures))
+    nearest = chain_of(channel)
+    assert nearest is not None
+    assert [nearest.loss_rate, nearest.mean_burst] == pytest.approx([chain.loss_rate, chain.mean_burst])
+    assert "four states" in differences[0]
+
+
+@pytest.mark.parametrize("line", ["loss", "loss 101%", "netem", "delay fast", "lose 5%", "limit 1000"])
+def test_what_netem_would_not_take_is_refused(line: str) -> None:
+    with pytest.raises(NetemError):
+        read(line)
+
+
+def test_a_file_with_a_line_is_a_setting(tmp_path: Path) -> None:
+    path = tmp_path / "netem.txt"
+    path.write_text("# as on the bench\ntc qdisc add dev eth0 root netem \\\n    delay 20ms loss 1%\n")
+    found = read_link(path)
+    assert isinstance(found, Setting)
+    assert (found.channel.delay, found.channel.p) == (0.02, 0.01)
+    path.write_text("delay 20ms\nloss 1%\n")
+    again = read_link(path)
+    assert isinstance(again, Setting)
+    assert again.channel == found.channel
+    path.write_text("tc qdisc add dev eth0 root netem loss 1%\ntc qdisc add dev eth1 root netem loss 2%\n")
+    with pytest.raises(MeasurementError, match="has 2 lines for netem, which are one link each"):
+        read_link(path)
