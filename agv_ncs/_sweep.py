@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.scenario import Scenario
+from agv_analysis.sweep import MOST_POINTS
 from agv_analysis.sweep.collect import collect
 from agv_analysis.sweep.execute import on_this_machine
 from agv_analysis.sweep.plan import Sweep, axis_of
 from agv_analysis.sweep.rows_file import write_rows
+from agv_analysis.sweep.verdicts import with_verdicts
 from agv_ros.errors import UserError
 
 
@@ -25,8 +27,9 @@ class SweepResult:
 
     rows: list[dict[str, Any]]
     """By column: the varied parameters, `runs`, `unstable`, `instability` with its 95 % confidence interval
-    `instability_low` and `instability_high`, `diverged`, and of each metric the median `<metric>_p50` and the 95th
-    percentile `<metric>_p95`; as in the CSV file of `agv-ncs sweep`."""
+    `instability_low` and `instability_high`, `undecided`, `diverged`, and of each metric the median `<metric>_p50` and
+    the 95th percentile `<metric>_p95`; as in the CSV file of `agv-ncs sweep`. With verdicts `verdict` and
+    `verdict_reason`, too."""
     axes: dict[str, tuple[Any, ...]]
     """The values of each varied parameter, by its name."""
     _sweep: Sweep = field(repr=False)
@@ -60,17 +63,21 @@ def sweep(
     seeds: int = 20,
     workers: int | None = None,
     progress: Callable[[int], None] = lambda runs: None,
+    verdicts: bool | None = None,
 ) -> SweepResult:
     """Simulate a scenario at every combination of the values in `vary`, each under `seeds` seeds from relay.seed on.
 
     `vary` gives values by parameter: {"controller.kx": [5.0, 25.0], "relay.uplink.p": np.linspace(0.0, 0.5, 11)}. A run
     is unstable if a twin that begins a micrometre away and meets the same losses does not come closer by its end.
-    `workers` threads, one a core by default, do the work; `progress` receives the number of runs done. Raises UserError
-    for a parameter or value that cannot be used.
+    `verdicts`: whether to add the word on each point, by the rules of `agv-ncs stability`; by default for up to 200
+    points. `workers` threads, one a core by default, do the work; `progress` receives the number of runs done. Raises
+    UserError for a parameter or value that cannot be used.
     """
     plan = Sweep(scenario, tuple(axis_of(name, values) for name, values in vary.items()), seeds)
     plan.check()
     rows, is_complete = collect(plan, None, partial(on_this_machine, plan, workers=workers), progress)
     if not is_complete:
         raise KeyboardInterrupt
+    if verdicts or (verdicts is None and len(rows) <= MOST_POINTS):
+        rows = with_verdicts(plan, rows, workers)
     return SweepResult(rows, {axis.name: axis.values for axis in plan.axes}, plan)

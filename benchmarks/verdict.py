@@ -15,7 +15,7 @@ from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.criteria.criterion import RunFacts
-from agv_analysis.stability.evidence import judgements_of
+from agv_analysis.stability.evidence import Judgements
 from benchmarks.comparison import Comparison
 
 CONFIG = str(Path(__file__).parent.parent / "config" / "outages.yaml")
@@ -25,7 +25,7 @@ def measure() -> list[Comparison]:
     """The verdict against the criteria; compiled code is warm."""
     run = simulate(load_scenario(CONFIG))
     ours = _seconds(lambda: analyse(run))
-    criteria = _seconds(lambda: judgements_of(RunFacts(run)))
+    criteria = _seconds(lambda: dict(Judgements(RunFacts(run))))
     return [
         Comparison("verdict on 100 s", ours, "linear criteria alone", criteria, "s", smaller_is_better=True),
         Comparison("what the verdict adds", ours - criteria, "a second", 1.0, "s", 1.0, smaller_is_better=True),

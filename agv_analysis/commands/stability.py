@@ -62,7 +62,7 @@ def command(
 
     from agv_analysis.report.table import colour_of
     from agv_analysis.scenario import load_scenario
-    from agv_analysis.stability.empirical import simulated_twins, with_an_end
+    from agv_analysis.stability.empirical import simulated_twins, too_short, with_an_end
     from agv_analysis.stability.evidence import evidence_of_scenario
     from agv_analysis.stability.margins import margins
     from agv_analysis.stability.repeated_run import settles_without_losses
@@ -81,18 +81,20 @@ def command(
         status.update("simulating twins under more and more losses ...")
         border = twins_border(run, progress=lambda done: status.update(f"simulating twins: {done} loss probabilities"))
         found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
-        evidence = evidence_of_scenario(scenario, twins)
+        evidence = evidence_of_scenario(scenario, twins.evidence)
         verdict = decide(evidence)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
     policy = scenario.error_detector.policy
-    table.add_row("Verdict", f"[bold {colour_of(verdict)}]{verdict.word}[/] (by {verdict.criterion})")
+    table.add_row("Verdict", f"[bold {colour_of(verdict.word)}]{verdict.word}[/] (by {verdict.criterion})")
     table.add_row("Because", escape(verdict.reason))
     table.add_row("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
     said_of_twins = _told(twins, seeds)
     if twins.contracting and not settles_without_losses(scenario):
         said_of_twins += "; they come together, but the loop does not settle even without losses"
+    elif not twins.is_long_enough and settles_without_losses(scenario):
+        said_of_twins += f"; {too_short(twins.left_without_losses)}"
     for name, value in (*found.rows(), ("Twins of this scenario, simulated", said_of_twins)):
         table.add_row(name, escape(value))
     console.print(table)

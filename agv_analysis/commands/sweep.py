@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from agv_analysis.commands import with_report, with_settings
-from agv_analysis.sweep import METRICS
+from agv_analysis.sweep import METRICS, MOST_POINTS
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from agv_analysis.sweep.execute import Results
     from agv_analysis.sweep.plan import Part, Sweep
 
@@ -32,6 +35,10 @@ _LONGEST_TABLE = 40
 @click.option("--out", type=click.Path(path_type=Path), help="Keep results and pictures in this directory.")
 @click.option("--format", "suffix", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True)
 @click.option("--resume", is_flag=True, help="Go on with the sweep in --out, which was stopped.")
+@click.option(
+    "--verdicts/--no-verdicts", default=None,
+    help=f"A verdict on each point, by the rules of `stability`; by default for up to {MOST_POINTS} points.",
+)  # fmt: skip
 @click.option("--workers", type=click.IntRange(1), help="Threads on this machine; one a core by default.")
 @click.option("--scheduler", metavar="ADDRESS", help="Run on the Dask cluster whose scheduler is there.")
 @with_report
@@ -44,6 +51,7 @@ def command(
     out: Path | None,
     suffix: str,
     resume: bool,
+    verdicts: bool | None,
     workers: int | None,
     scheduler: str | None,
     report: Path | None,
@@ -52,8 +60,9 @@ def command(
     """Simulate the params file PARAMS at every point of a grid, under many seeds: how likely is the loop unstable?
 
     A run is unstable if a twin that begins a micrometre away and meets the same losses does not come closer by its end,
-    or if the loop does not settle even without losses. Every point meets the same seeds, so points with the same
-    channel meet the same outages.
+    or if the loop does not settle even without losses; undecided, if runs are shorter than its transient. Every point
+    meets the same seeds, so points with the same channel meet the same outages. The verdict on a point is that of
+    `stability`, with the runs of the sweep for its twins if they are ten or more.
 
     \b
     Examples:
@@ -67,6 +76,7 @@ def command(
     from agv_analysis.sweep.collect import collect
     from agv_analysis.sweep.plan import Sweep, SweepError, parse_axis
     from agv_analysis.sweep.store import Store
+    from agv_analysis.sweep.verdicts import with_verdicts
 
     if resume and out is None:
         raise SweepError("--resume goes on with a sweep in a directory: name it by --out")
@@ -81,6 +91,11 @@ def command(
 
     with step_bar(sweep.size * seeds, "simulating") as progress:
         rows, complete = collect(sweep, store, results, progress)
+    if complete and (verdicts or (verdicts is None and len(rows) <= MOST_POINTS)):
+        with step_bar(len(rows), "judging") as progress, suppress(KeyboardInterrupt):
+            complete = False
+            rows = with_verdicts(sweep, rows, workers, progress)
+            complete = True
     _write_rows(sweep, rows, metrics, out, suffix)
     _write_reports(sweep, rows, report, figures)
     if not complete:
@@ -131,6 +146,7 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
     from agv_analysis.report.table import metres
+    from agv_analysis.sweep.verdicts import counted
 
     table = Table(box=None, pad_edge=False)
     for axis in sweep.axes:
@@ -138,11 +154,43 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     for name in ("runs", "unstable", "probability", "95 % confidence", "to 1 cm [steps]", "deviation"):
         table.add_column(escape(name), justify="right", no_wrap="%" in name)
     for row in rows:
-        values = [row[axis.name] for axis in sweep.axes]
         table.add_row(
-            *(f"{value:.6g}" if isinstance(value, float) else str(value) for value in values),
-            str(row["runs"]), str(row["unstable"]), f"{row['instability']:.3f}",
+            *(_plain(row[axis.name]) for axis in sweep.axes),
+            str(row["runs"]), str(row["unstable"]), "-" if row["undecided"] else f"{row['instability']:.3f}",
             f"{row['instability_low']:.3f} .. {row['instability_high']:.3f}", f"{row['settle_1cm_steps_p50']:g}",
             metres(row["deviation_max_p50"]),
         )  # fmt: skip
-    Console(highlight=False).print(table)
+    console = Console(highlight=False)
+    console.print(table)
+    if rows and "verdict" in rows[0]:
+        console.print(_verdicts(sweep, rows))
+        console.print(f"Verdicts: {counted(rows)}")
+    unsaid = sum(row["undecided"] for row in rows)
+    if unsaid:
+        console.print(
+            f"[bold yellow]Undecided:[/] {unsaid} runs are shorter than the transient of the loop without losses, "
+            "so twins that are not closer by their end say nothing; make plant.duration longer."
+        )
+
+
+def _verdicts(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
+    """The word on each point, and why."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from agv_analysis.report.table import colour_of
+
+    table = Table(box=None, pad_edge=False)
+    for axis in sweep.axes:
+        table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
+    table.add_column("verdict")
+    table.add_column("because")
+    for row in rows:
+        word = row["verdict"]
+        values = (_plain(row[axis.name]) for axis in sweep.axes)
+        table.add_row(*values, f"[{colour_of(word)}]{word}[/]", escape(row["verdict_reason"]))
+    return table
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

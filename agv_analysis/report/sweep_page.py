@@ -12,9 +12,11 @@ import numpy as np
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, plain
 from agv_analysis.report.plotly import figure
+from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.picture import COLOURS, across_and_up, can_draw, draw
 from agv_analysis.sweep.plan import Axis, Sweep
+from agv_analysis.sweep.verdicts import counted
 from agv_ros.errors import UserError
 
 _MOST_ROWS = 500
@@ -23,14 +25,20 @@ Rows = list[dict[str, Any]]
 
 
 def sweep_sentence(rows: Rows) -> str:
-    """What a sweep found, in one sentence."""
+    """What a sweep found, in one sentence: a point counts as stable if every run is and its verdict does not object."""
     if not rows:
         return "No point of the sweep was run."
-    calm = sum(row["unstable"] == 0 for row in rows)
+    short = sum(row.get("undecided", 0) > 0 for row in rows)
+    calm = sum(row["unstable"] == 0 and not row.get("undecided") and _is_green(row) for row in rows)
     bad = sum(row["unstable"] == row["runs"] for row in rows)
     if calm == len(rows):
         return f"The loop is stable in every run at all {len(rows)} points."
-    return f"Of {len(rows)} points the loop is stable in every run at {calm}, and in none at {bad}."
+    too_short = f"; at {short} runs are too short to say" if short else ""
+    return f"Of {len(rows)} points the loop is stable in every run at {calm}, and in none at {bad}{too_short}."
+
+
+def _is_green(row: dict[str, Any]) -> bool:
+    return row.get("verdict", MEAN_SQUARE) in GREEN
 
 
 def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> None:
@@ -41,10 +49,17 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
     html = fill(
         "sweep.html.j2",
         figures=drawn,
-        data={"sentence": sweep_sentence(rows), "points": plain, "parameters": parameters, "versions": versions()},
+        data={
+            "sentence": sweep_sentence(rows),
+            "words": counted(rows),
+            "points": plain,
+            "parameters": parameters,
+            "versions": versions(),
+        },
         title="agv_ncs: sweep",
         verdict=sweep_sentence(rows),
         word="unknown",
+        words=counted(rows),
         sections=[{"key": key, "title": "Probability of instability", "height": 520} for key in drawn],
         columns=list(plain[0]) if plain else [],
         rows=plain[:_MOST_ROWS],
@@ -78,7 +93,7 @@ def _curve(sweep: Sweep, axis: Axis, rows: Rows) -> dict[str, Any]:
 def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
     across, up = across_and_up(sweep)
     x_values, y_values = sorted(across.values), sorted(up.values)
-    places = {(row[across.name], row[up.name]): row["instability"] for row in rows}
+    places = {(row[across.name], row[up.name]): _plain(row["instability"]) for row in rows}
     z = [[places.get((i, j)) for i in x_values] for j in y_values]
     heat = {"type": "heatmap", "x": x_values, "y": y_values, "z": z, "zmin": 0.0, "zmax": 1.0}
     layout = {

@@ -14,14 +14,14 @@ from agv_analysis.metrics.outages import loss_causes
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.margins import margins
-from agv_analysis.stability.verdict import BOUNDED, GREEN, UNDECIDED, UNKNOWN, Verdict
+from agv_analysis.stability.verdict import BOUNDED, GREEN, UNDECIDED, UNKNOWN
 
 _YELLOW = (BOUNDED, UNDECIDED, UNKNOWN)
 
 
-def colour_of(verdict: Verdict) -> str:
+def colour_of(word: str) -> str:
     """Colour of a verdict's word, in rich's markup."""
-    return "green" if verdict.word in GREEN else "yellow" if verdict.word in _YELLOW else "red"
+    return "green" if word in GREEN else "yellow" if word in _YELLOW else "red"
 
 
 _NOT_JUDGED = "not judged: messages are missing that no channel lost"
@@ -193,7 +193,7 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
         if found.why:
             yield found.label, _judged(found.stable, escape(found.why))
     verdict = analysis.verdict
-    yield "Verdict", f"[bold {colour_of(verdict)}]{verdict.word}[/] (by {verdict.criterion})"
+    yield "Verdict", f"[bold {colour_of(verdict.word)}]{verdict.word}[/] (by {verdict.criterion})"
     if verdict.word in GREEN:
         yield "Margin", escape(verdict.margin)
     yield "Because", escape(verdict.reason)

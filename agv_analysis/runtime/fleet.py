@@ -21,7 +21,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.batch import TWIN_OFFSET
 from agv_analysis.stability.analysis import analyse
-from agv_analysis.stability.empirical import distances
+from agv_analysis.stability.empirical import distances, is_unstable, left_without_losses
 from agv_analysis.stability.repeated_run import settles_without_losses
 from agv_plant.channels.registry import SHARED
 from agv_plant.parameters import ChannelParameters
@@ -146,15 +146,18 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
         verdict_criterion=figures["verdict_criterion"],
         verdict_reason=figures["verdict_reason"],
         contraction=contraction if contraction is not None and math.isfinite(contraction) else None,
-        unstable=_is_unstable(found.run.scenario, contraction),
+        unstable=_is_unstable(found.run, contraction),
     )
 
 
-def _is_unstable(scenario: Scenario, contraction: float | None) -> bool | None:
-    """As a sweep counts it: twins do not come together, or the loop does not settle even without losses."""
-    if not settles_without_losses(scenario):
+def _is_unstable(run: Run, contraction: float | None) -> bool | None:
+    """As a sweep counts it; None where that is not known, or the run is too short to say."""
+    if not settles_without_losses(run.scenario):
         return True
-    return None if contraction is None else not contraction < 1.0
+    if contraction is None:
+        return None
+    plant = replace(run.scenario.plant, duration=len(run) * run.ts)
+    return is_unstable(contraction, left_without_losses(replace(run.scenario, plant=plant)))
 
 
 def twins(run: Run) -> float | None:

@@ -15,7 +15,7 @@ from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Run
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts
 from agv_analysis.stability.criteria.paper_test import PaperTest
-from agv_analysis.stability.evidence import evidence_of_run, judgements_of, verdict_of_run
+from agv_analysis.stability.evidence import Judgements, evidence_of_run, verdict_of_run
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
 from agv_analysis.stability.verdict import Evidence, Verdict
 from agv_ros.errors import UserError
@@ -215,7 +215,7 @@ def analyse(run: Run) -> Analysis:
     if not run.gains_known:
         raise UserError(f"{run.source}: {GAINS_UNKNOWN}")
     facts, converged = RunFacts(run), convergence(run)
-    judgements = judgements_of(facts)
+    judgements = dict(Judgements(facts))
     evidence = evidence_of_run(facts, judgements)
     return Analysis(
         run=run,

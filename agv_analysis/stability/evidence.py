@@ -22,10 +22,10 @@ from agv_analysis.stability.criteria.any_outages import longest_for
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
 from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
 from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
-from agv_analysis.stability.empirical import Twins, with_an_end
+from agv_analysis.stability.empirical import with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.repeated_run import RepeatedRun, repeated_run
-from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, Evidence, Verdict, decide, weakest
+from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, UNSTABLE, Evidence, Verdict, decide, weakest
 
 _TIMES_AS_FAR = 2.0
 """A recorded deviation may be this many times the simulated one, for what the model of the plant does not know."""
@@ -40,10 +40,27 @@ _NOISE = 6.0
 """Standard deviations of the measurement noise by which it may be larger."""
 
 
-def judgements_of(facts: RunFacts) -> dict[str, Judgement]:
-    """What each criterion that applies says of a run, by its key."""
-    judged = {criterion.key: criterion.judge(facts) for criterion in CRITERIA}
-    return {key: found for key, found in judged.items() if found is not None}
+class Judgements(Mapping[str, Judgement]):
+    """What each criterion that applies says of a run, by its key; a criterion is asked when it is looked up."""
+
+    def __init__(self, facts: RunFacts) -> None:
+        self._facts = facts
+        self._judge = {criterion.key: criterion.judge for criterion in CRITERIA}
+        self._found: dict[str, Judgement | None] = {}
+
+    def __getitem__(self, key: str) -> Judgement:
+        if key not in self._found:
+            self._found[key] = self._judge[key](self._facts)
+        found = self._found[key]
+        if found is None:
+            raise KeyError(key)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return (key for key in self._judge if key in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 def verdict_of_run(facts: RunFacts, evidence: Evidence) -> Verdict:
@@ -56,7 +73,7 @@ def verdict_of_run(facts: RunFacts, evidence: Evidence) -> Verdict:
     for (begin, scenario), end in zip(parts, ends, strict=True):
         rows = slice(*np.searchsorted(run.k, (begin, end)))
         part = RunFacts(replace(run.part(rows), scenario=scenario, parameter_changes=()))
-        word = decide(evidence_of_run(part, judgements_of(part)))
+        word = decide(evidence_of_run(part, Judgements(part)))
         where = f"parameters were changed, and from {begin * run.ts:g} s to {end * run.ts:g} s"
         found.append(replace(word, reason=f"{where}: {word.reason}"))
     return weakest(found)
@@ -73,14 +90,22 @@ def evidence_of_run(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evi
 def _evidence(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
     """All that decides the word."""
     run, missing = facts.run, sum(facts.run.unexplained.values())
-    common = Evidence(
-        n=facts.n, v_max=run.scenario.controller.v_max, infeasible=facts.infeasible, missing=missing
-    )  # fmt: skip
+    common = replace(_common(facts), missing=missing)
     if not facts.is_feasible or missing:
         return common
     driven, repeated = driven_commands(run), repeated_run(run, facts.loop)
     contradictions = tuple(_contradictions(run, driven, repeated))
     common = replace(common, driven=driven, repeated=repeated, contradictions=contradictions)
+    return _under_links_as_seen(common, facts, judgements)
+
+
+def _common(facts: RunFacts) -> Evidence:
+    return Evidence(n=facts.n, v_max=facts.run.scenario.controller.v_max, infeasible=facts.infeasible)
+
+
+def _under_links_as_seen(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
+    """With the growth under the links, as far as the run shows them."""
+    run = facts.run
     if facts.is_late:
         return _of_late_messages(common, facts, judgements)
     if run.downlink_lost.any():
@@ -93,17 +118,28 @@ def _evidence(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
 
 def _with_margin(evidence: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
     """With what only a green word asks for, and what takes longest: which outages any sequence may have, and longer."""
-    is_of_outages = evidence.growth is not None and evidence.growth_of == "mean_square"
-    if not is_of_outages or decide(evidence).word not in GREEN:
+    if not _asks_for_outages(evidence):
         return evidence
     if facts.loop.closed_form is None and not facts.loop.is_constant:  # half a minute for a number beside the word
-        found = replace(evidence, n_bursts=facts.n if judgements["bursts"].stable else -1, is_least=True)
+        found = _with_longest(evidence, facts, judgements)
     else:
         n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
         found = replace(evidence, n_bursts=n_bursts)
     if evidence.link is None or decide(found).word != MEAN_SQUARE:
         return found
     return replace(found, burst_left=_burst_left(facts.fit, evidence.link, facts.loop))
+
+
+def _with_longest(evidence: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
+    """With whether outages of up to the longest one are survived in any order, which only a green word asks for."""
+    if not _asks_for_outages(evidence) or evidence.is_unlimited:
+        return evidence
+    return replace(evidence, n_bursts=facts.n if judgements["bursts"].stable else -1, is_least=True)
+
+
+def _asks_for_outages(evidence: Evidence) -> bool:
+    is_of_outages = evidence.growth is not None and evidence.growth_of == "mean_square"
+    return is_of_outages and decide(evidence).word in GREEN
 
 
 def _loses_nothing(run: Run) -> bool:
@@ -113,29 +149,42 @@ def _loses_nothing(run: Run) -> bool:
     return is_perfect and run.seed_known and not run.lost.any()
 
 
-def evidence_of_scenario(scenario: Scenario, twins: Twins | None = None) -> Evidence:
+def evidence_of_scenario(
+    scenario: Scenario, twins: tuple[int, int] | None = None, with_margin: bool = True
+) -> Evidence:
     """Of a scenario: as of a run of it, a lap or all that it lasts, but with the channel known where it is a chain.
 
-    `twins` are those that were simulated of it. Raises TrackFileError if the track's file cannot be used.
+    `twins`: how many of how many simulated runs of it contract the distance of twins. Without the margin, `n_bursts`
+    only says whether the longest outage is survived, and nothing is simulated that cannot change the word: that takes a
+    fraction of a second.
+
+    Raises TrackFileError if the track's file cannot be used.
     """
-    run = simulate(with_an_end(scenario))
-    facts = RunFacts(run)
-    judgements = judgements_of(facts)
-    found = _evidence(facts, judgements)
-    found = replace(found, twins=None if twins is None else (twins.contracting, len(twins.contraction)))
-    uplink, downlink = chain_of(scenario.relay.uplink), chain_of(scenario.relay.downlink)
-    if not facts.is_feasible or facts.is_late or uplink is None or downlink is None:
-        return _with_margin(found, facts, judgements)
-    policy = scenario.plant.downlink_policy
-    if downlink.loss_rate > 0.0:
-        if policy not in mean_square_two_links.POLICIES:
-            return found
-        links = joint_chain.correlated(uplink, downlink, scenario.relay.downlink.correlation)
-        both = mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
-        return _with_growth(found, both, "both_links")
-    growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
-    known = replace(found, link=None, is_unlimited=_is_random(uplink))
-    return _with_margin(_with_growth(known, growth), facts, judgements)
+    facts = RunFacts(simulate(with_an_end(scenario)))
+    judgements, common = Judgements(facts), replace(_common(facts), twins=twins)
+    if not facts.is_feasible:
+        return common
+    found = _under_links(common, facts, judgements)
+    if not with_margin and math.isinf(found.v_max) and decide(found).word == UNSTABLE:
+        return found
+    found = replace(found, repeated=repeated_run(facts.run, facts.loop))
+    return _with_margin(found, facts, judgements) if with_margin else _with_longest(found, facts, judgements)
+
+
+def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
+    """With the growth under the links of a scenario; as a run of it shows them where one of them is no finite chain."""
+    run, relay, policy = facts.run, facts.run.scenario.relay, facts.run.scenario.plant.downlink_policy
+    uplink, downlink = chain_of(relay.uplink), chain_of(relay.downlink)
+    if facts.is_late or uplink is None or downlink is None:
+        return _under_links_as_seen(common, facts, judgements)
+    if downlink.loss_rate == 0.0:
+        growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
+        return _with_growth(replace(common, is_unlimited=_is_random(uplink)), growth)
+    if policy not in mean_square_two_links.POLICIES:
+        return _of_both_links(common, facts, judgements)
+    links = joint_chain.correlated(uplink, downlink, relay.downlink.correlation)
+    both = mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
+    return _with_growth(common, both, "both_links")
 
 
 def _is_random(chain: Chain) -> bool:

@@ -171,7 +171,7 @@ class Margins:
         growing = [
             margin.value for name, margin in self.found.items() if name.endswith(GROWTH) and margin.value is not None
         ]
-        if self.twins is None or not growing or self.twins.mostly_contracting:
+        if self.twins is None or not growing or self.twins.mostly_contracting or not self.twins.is_long_enough:
             return
         if max(growing) * (self.twins.steps or 1) > -_PLAIN:
             return  # too short a run for E[e^2] to die out

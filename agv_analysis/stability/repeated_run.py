@@ -47,6 +47,12 @@ _LAPS = 3
 _SETTLED = 1e-3
 """Up to this distance [m, m, rad] from the nominal motion a loop has settled."""
 
+_NEAR = 0.01
+"""So far [m, m, rad] beside the nominal motion an AGV must come back to it."""
+
+_ARRIVED = 1e-6
+"""Within this distance [m, m, rad] of the nominal motion there is no need to drive on."""
+
 _MET = 1e-6
 """Up to this distance [m, m, rad] two AGVs have met."""
 
@@ -76,9 +82,12 @@ class RepeatedRun:
     stays: bool
     """With the losses: is the largest deviation no larger in the last third of the time than in the one before?"""
     largest_deviation: float
-    """Largest distance from the reference in the last third [m]; inf if the loop diverges."""
+    """Largest distance from the reference in the last third [m], of the runs with the losses and of one that does not
+    settle without any; inf if the loop diverges."""
     largest_in_run: float
     """Largest distance from the reference in the second half of the first repetition, which is the run [m]."""
+    unsettled: str = ""
+    """Where it does not settle: what does not do what; empty if it settles."""
 
     @property
     def is_stable(self) -> bool:
@@ -97,13 +106,7 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
     count = min(max(3, math.ceil(SECONDS / (steps * run.ts))), max(3, _MOST_STEPS // steps))
     reference = _repeated_reference(run.scenario, run.reference, count)
     starts, columns = _starts(run.scenario, run.pose[0], run.reference[0]), _moved_by_commands(loop)
-    settles = all(
-        _settles(
-            _without_losses(run.scenario, reference, _start(run.scenario, run.pose[0, :3] + offset), count * steps),
-            reference, run.scenario, loop, may_be_elsewhere=offset != 0.0,
-        )
-        for offset in (0.0, *_BESIDE)
-    )  # fmt: skip
+    unsettled = _unsettled(run, reference, count, loop)
     meets, thirds, in_run = True, [], np.zeros(0)
     for shift in _shifts(run):
         begun = _under_losses(run, reference, starts[0], count, shift)
@@ -113,14 +116,57 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
         thirds.append(_largest_of_thirds(deviation, steps))
         if shift == 0:
             in_run = deviation[steps // 2 : steps]
+    if unsettled is not None:
+        thirds.append(_largest_of_thirds(_deviation(unsettled[1], reference), steps))
     return RepeatedRun(
         seconds=count * steps * run.ts,
-        settles=settles,
+        settles=unsettled is None,
         meets=meets,
         stays=all(_does_not_grow(before, last) for before, last in thirds),
         largest_deviation=max(last for _, last in thirds),
         largest_in_run=float(in_run.max()),
+        unsettled="" if unsettled is None else unsettled[0],
     )
+
+
+def _unsettled(run: Run, reference: Floats, count: int, loop: LinearLoop) -> tuple[str, Floats] | None:
+    """What of the loop without losses does not settle, and the poses of an AGV that does not; None if all of it does.
+
+    From where the run began it must come to the nominal motion, and from beside that motion come back to it; from
+    further away it may come to another steady motion. One that has come very near in a quarter of the time is not
+    driven any further: from beside it a loop does not come so near to a motion that it leaves again.
+    """
+    quarter, steps = max(1, count // 4) * len(run), count * len(run)
+    begun, nominal = run.pose[0, :3], _pose_of_nominal(reference[run.scenario.controller.steps_ahead], loop)
+    starts = [(begun, True, "the loop does not settle on its nominal motion")]
+    for offset in (-_NEAR, _NEAR):
+        starts.append(
+            (nominal + offset, True, f"an AGV that begins {_NEAR:g} m and rad beside the nominal motion stays off it")
+        )
+    for offset in _BESIDE:
+        starts.append(
+            (begun + offset, False, f"an AGV that begins {abs(offset):g} m and rad beside this one does not settle")
+        )
+    for i, (at, must_return, what) in enumerate(starts):
+        start = _start(run.scenario, at)
+        if i > 0:
+            poses = _without_losses(run.scenario, reference, start, quarter)
+            last = np.arange(quarter * 19 // 20, quarter)
+            if np.isfinite(poses).all() and _distances(poses, reference, run.scenario, loop, last).max() <= _ARRIVED:
+                continue
+        poses = _without_losses(run.scenario, reference, start, steps)
+        if not _settles(poses, reference, run.scenario, loop, may_be_elsewhere=not must_return):
+            return what, poses
+    return None
+
+
+def _pose_of_nominal(reference: Floats, loop: LinearLoop) -> Floats:
+    """The pose of an AGV on the nominal motion at the first step, X_r(0) and its speeds of shape (5,)."""
+    x, y, theta = reference[:3]
+    x_e, y_e, theta_e = (0.0, 0.0, 0.0) if loop.nominal is None else loop.nominal[0, :3]
+    heading = theta - theta_e
+    c, s = math.cos(heading), math.sin(heading)
+    return np.array([x - c * x_e + s * y_e, y - s * x_e - c * y_e, heading])
 
 
 def settles_without_losses(scenario: Scenario) -> bool:
@@ -273,18 +319,22 @@ def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearL
     """Does a loop settle on its nominal motion, or, if it may, on another one that repeats itself over a lap?"""
     if not np.isfinite(poses).all():
         return False
-    ahead, columns = scenario.controller.steps_ahead, _moved_by_commands(loop)
-
-    def distance(rows: NDArray[np.int64]) -> Floats:
-        error = body_errors(reference[rows + ahead], poses[rows])
-        if loop.nominal is not None:
-            error = error - loop.nominal[rows % len(loop.nominal), :3]
-        error[:, 2] = wrapped(error[:, 2])
-        return np.asarray(np.abs(error[:, columns]).max(axis=1))
-
-    if _is_small_or_shrinks([distance(rows) for rows in _moments(len(poses))], _SETTLED):
+    distances = [_distances(poses, reference, scenario, loop, rows) for rows in _moments(len(poses))]
+    if _is_small_or_shrinks(distances, _SETTLED):
         return True
+    ahead = scenario.controller.steps_ahead
     return may_be_elsewhere and _repeats(poses, reference[ahead : ahead + len(poses)], loop)
+
+
+def _distances(
+    poses: Floats, reference: Floats, scenario: Scenario, loop: LinearLoop, rows: NDArray[np.int64]
+) -> Floats:
+    """Distance of the tracking error from that of the nominal motion [m, m, rad], at some steps, shape (n,)."""
+    error = body_errors(reference[rows + scenario.controller.steps_ahead], poses[rows])
+    if loop.nominal is not None:
+        error = error - loop.nominal[rows % len(loop.nominal), :3]
+    error[:, 2] = wrapped(error[:, 2])
+    return np.asarray(np.abs(error[:, _moved_by_commands(loop)]).max(axis=1))
 
 
 def _repeats(poses: Floats, compared: Floats, loop: LinearLoop) -> bool:

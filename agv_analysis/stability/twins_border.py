@@ -7,11 +7,14 @@ small long before the linear border of almost sure convergence; what the loop it
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.stability.criteria.criterion import Margin
+from agv_analysis.stability.empirical import LONG_ENOUGH, left_without_losses, too_short
+from agv_analysis.stability.repeated_run import settles_without_losses
 
 NAME, LABEL = "p_max.twins", "Independent losses, most twins contract"
 
@@ -42,6 +45,9 @@ def twins_border(scenario: Scenario, seeds: int = SEEDS, progress: Callable[[int
         progress(done)
         return int((found < 1.0).sum()) * 2 > seeds
 
+    left = left_without_losses(scenario)
+    if LONG_ENOUGH < left < math.inf and settles_without_losses(scenario):
+        return Margin(NAME, LABEL, None, reason=f"no answer: {too_short(left)}")
     above = next((p for p in _GRID if not contract(p)), None)
     if above is None:
         return Margin(NAME, LABEL, None, reason=f"no bound: most of {seeds} runs contract at every p up to {_GRID[-1]}")

@@ -41,7 +41,8 @@ INFEASIBLE = "infeasible"
 GREEN = (ASYMPTOTIC, MEAN_SQUARE)
 """Words that say that a loop is stable."""
 
-_FROM_STRONGEST = (ASYMPTOTIC, MEAN_SQUARE, UNDECIDED, UNKNOWN, BOUNDED, UNSTABLE, INFEASIBLE)
+WORDS = (ASYMPTOTIC, MEAN_SQUARE, UNDECIDED, UNKNOWN, BOUNDED, UNSTABLE, INFEASIBLE)
+"""From the best to the worst."""
 
 SIMULATION = "simulation"
 """The criterion of a word that the simulation of the nonlinear loop decided."""
@@ -137,7 +138,7 @@ def decide(evidence: Evidence) -> Verdict:
 
 def weakest(verdicts: Sequence[Verdict]) -> Verdict:
     """The worst of several verdicts, the first of its kind."""
-    return max(verdicts, key=lambda verdict: _FROM_STRONGEST.index(verdict.word))
+    return max(verdicts, key=lambda verdict: WORDS.index(verdict.word))
 
 
 def _by_criteria(evidence: Evidence) -> Verdict:
@@ -238,7 +239,8 @@ def _against_stability(evidence: Evidence) -> str:
     repeated, twins = evidence.repeated, evidence.twins
     if repeated is not None:
         if not repeated.settles:
-            return "simulated without any loss the loop does not settle on its nominal motion"
+            what = repeated.unsettled or "the loop does not settle on its nominal motion"
+            return f"simulated without any loss {what}"
         if not repeated.stays:
             return (
                 "simulated under these losses again and again the deviation grows, to "

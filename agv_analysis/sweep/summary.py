@@ -12,18 +12,11 @@ from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.run import Floats
 from agv_analysis.simulation.batch import Table
 from agv_analysis.simulation.decay import NOT_SETTLED
+from agv_analysis.stability.empirical import is_unstable, left_without_losses
 from agv_analysis.stability.repeated_run import settles_without_losses
 from agv_analysis.sweep import METRICS
 from agv_analysis.sweep.plan import Sweep
 from agv_analysis.version import version
-
-
-def instability(table: Table, settles: bool) -> NDArray[np.bool_]:
-    """Is each run of a point unstable: does it not contract the distance of twins that meet the same losses?
-
-    Where the loop does not even settle without losses every run is: twins may well come together while both drift away.
-    """
-    return np.asarray(~(table["contraction"] < 1.0) | (not settles))
 
 
 def summarise(sweep: Sweep, table: Table, done: NDArray[np.bool_]) -> list[dict[str, Any]]:
@@ -32,14 +25,19 @@ def summarise(sweep: Sweep, table: Table, done: NDArray[np.bool_]) -> list[dict[
 
 
 def _row(sweep: Sweep, point: int, runs: Table) -> dict[str, Any]:
-    settles = settles_without_losses(sweep.scenario(point))
-    unstable = int(np.count_nonzero(instability(runs, settles)))
-    low, high = clopper_pearson(unstable, len(runs))
+    scenario = sweep.scenario(point)
+    settles = settles_without_losses(scenario)
+    left = left_without_losses(scenario)
+    # Where the loop does not even settle without losses twins may well come together while both drift away.
+    said = [is_unstable(contraction, left) if settles else True for contraction in runs["contraction"].tolist()]
+    unstable, unsaid = said.count(True), said.count(None)
+    low, high = clopper_pearson(unstable, len(runs))[0], clopper_pearson(unstable + unsaid, len(runs))[1]
     row: dict[str, Any] = {axis.name: value for axis, value in zip(sweep.axes, sweep.values(point), strict=True)}
     row |= {
         "runs": len(runs),
         "unstable": unstable,
-        "instability": unstable / len(runs),
+        "undecided": unsaid,
+        "instability": math.nan if unsaid else unstable / len(runs),
         "instability_low": low,
         "instability_high": high,
         "settles_without_losses": settles,

@@ -106,7 +106,8 @@ def test_our_recording_read_as_that_of_a_robot(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def swept() -> agv_ncs.SweepResult:
     scenario = agv_ncs.load_scenario(PAPER, LOSSY)
-    return agv_ncs.sweep(scenario, {"controller.kx": [25, 250.0], "relay.uplink.p": np.array([0.0, 0.3, 0.9])}, seeds=3)
+    vary: dict[str, list[float]] = {"controller.kx": [25, 250.0], "relay.uplink.p": [0.0, 0.3, 0.9]}
+    return agv_ncs.sweep(scenario, vary, seeds=3, verdicts=False)
 
 
 def test_a_sweep_is_that_of_the_command_line(swept: agv_ncs.SweepResult) -> None:
@@ -114,6 +115,11 @@ def test_a_sweep_is_that_of_the_command_line(swept: agv_ncs.SweepResult) -> None
     plan = Sweep(agv_ncs.load_scenario(PAPER, LOSSY), axes, 3)
     rows, _ = collect(plan, None, lambda parts: on_this_machine(plan, parts), lambda done: None)
     assert json.dumps(swept.rows) == json.dumps(rows)
+
+
+def test_a_sweep_has_a_verdict_on_each_point() -> None:
+    (row,) = agv_ncs.sweep(agv_ncs.load_scenario(PAPER, LOSSY), {"relay.uplink.p": np.array([0.97])}, seeds=1).rows
+    assert (row["verdict"], row["verdict_reason"]) == ("unstable", "under this link the mean square of the error grows")
 
 
 def test_columns_of_a_sweep_have_its_shape(swept: agv_ncs.SweepResult, tmp_path: Path) -> None:

@@ -31,8 +31,7 @@ class RunFacts:
     def __init__(self, run: Run, found: Outages | None = None, fit: ChannelFit | None = None) -> None:
         self.run = run
         self.outages = outages(run) if found is None else found
-        self.fit = fit_channel(run.lost, run.k) if fit is None else fit
-        """The uplink as fitted to the run."""
+        self._fit = fit
         self.infeasible = ""
         """Why the loop has no motion about which it could be judged; empty if it has one."""
         self._loop: LinearLoop | None = None
@@ -62,6 +61,11 @@ class RunFacts:
     def is_late(self) -> bool:
         """Did messages arrive in a later slot than their own, by what the slots say or by when they came?"""
         return has_late(self.run.uplink) or has_late(self.run.downlink) or self.run.is_late
+
+    @cached_property
+    def fit(self) -> ChannelFit:
+        """The uplink as fitted to the run."""
+        return fit_channel(self.run.lost, self.run.k) if self._fit is None else self._fit
 
     @cached_property
     def downlink_fit(self) -> ChannelFit:

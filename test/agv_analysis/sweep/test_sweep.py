@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from agv_analysis.cli import main
 from agv_analysis.metrics.confidence import clopper_pearson
+from agv_analysis.report.sweep_page import sweep_sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.sweep.borders import margins
@@ -28,6 +29,7 @@ from agv_analysis.sweep.plan import Part, Sweep, SweepError, parse_axis
 from agv_analysis.sweep.rows_file import write_rows
 from agv_analysis.sweep.store import Store
 from agv_analysis.sweep.summary import quantiles
+from agv_analysis.sweep.verdicts import counted, with_verdicts
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
@@ -216,7 +218,30 @@ def test_a_row_says_what_the_batch_does() -> None:
     assert (row["controller.kx"], row["runs"], row["first_seed"]) == (60.0, 9, 1)
     assert row["iae_p50"] == np.sort(table["iae"])[4]
     assert row["peak_p95"] == np.sort(table["peak"])[8]
-    assert row["unstable"] == np.count_nonzero(table["contraction"] >= 1.0)
+    assert row["unstable"] + row["undecided"] == np.count_nonzero(table["contraction"] >= 1.0)
+
+
+def test_runs_shorter_than_the_transient_do_not_make_a_stable_loop_unstable() -> None:
+    """Across the line poles at 1/s: after a second twins are still further apart than at first, whatever the link."""
+    sweep = sweep_of("relay.uplink.p=0.3,0.97", seeds=4, given=(*BERNOULLI, "error_detector.track=line"))
+    stable, unstable = with_verdicts(sweep, rows_of(sweep))
+    assert (stable["unstable"], stable["undecided"], stable["verdict"]) == (0, 4, "mean-square")
+    assert np.isnan(stable["instability"])
+    assert (stable["instability_low"], stable["instability_high"]) == (0.0, 1.0)
+    assert unstable["verdict"] == "unstable"
+    assert "at 0, and in none at 0; at 2 runs are too short to say" in sweep_sentence([stable, unstable])
+    assert counted([stable, unstable]) == "1 mean-square, 1 unstable"
+
+
+def test_a_loop_that_does_not_settle_is_not_called_stable_by_the_headline() -> None:
+    given = ("error_detector.track=line", "plant.duration=20.0")
+    sweep = sweep_of("controller.v_max=0.8,inf", seeds=2, given=given)
+    rows = with_verdicts(sweep, rows_of(sweep))
+    assert [row["verdict"] for row in rows] == ["infeasible", "asymptotic"]
+    assert "falls behind its reference by 0.2 m/s" in rows[0]["verdict_reason"]
+    assert sweep_sentence(rows) == "Of 2 points the loop is stable in every run at 1, and in none at 1."
+    assert sweep_sentence(rows[1:]) == "The loop is stable in every run at all 1 points."
+    assert "at 0" in sweep_sentence([rows[1] | {"verdict": "bounded"}])
 
 
 def test_workers_and_interruptions_change_nothing(tmp_path: Path) -> None:
@@ -269,7 +294,7 @@ def test_a_cluster_gives_the_same_numbers_and_survives_the_loss_of_a_worker() ->
 
 def test_the_table_names_its_units_and_fits_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    options = ["--set", "plant.duration=1.0", "--vary", "controller.kx=5,25", "--seeds", "2"]
+    options = ["--set", "plant.duration=1.0", "--vary", "controller.kx=5,25", "--seeds", "2", "--no-verdicts"]
     said = CliRunner().invoke(main, ["sweep", PAPER, *options]).output
     assert "[steps]" in said
     assert re.search(r"^ +25 +2 +\d +\S+ +[\d.]+ \.\. [\d.]+ +47 +0\.00\d+ m$", said, re.MULTILINE), said
@@ -321,7 +346,8 @@ def test_a_damaged_part_is_named(tmp_path: Path, content: bytes) -> None:
 
 def test_parquet_holds_what_the_rows_do(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    rows = rows_of(sweep_of("controller.kx=5,25", "relay.uplink.p=0.1,0.9", seeds=3))
+    given = (*BERNOULLI, "plant.duration=8.0")
+    rows = rows_of(sweep_of("controller.kx=5,25", "relay.uplink.p=0.1,0.9", seeds=3, given=given))
     write_rows(rows, tmp_path / "points.parquet")
     assert parquet.read_table(tmp_path / "points.parquet").to_pylist() == rows
 
@@ -349,8 +375,9 @@ def test_the_command_prints_and_keeps_a_row_a_point(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     with open(tmp_path / "out" / "points.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [(row["controller.kx"], row["runs"], row["settle_1cm_steps_p50"]) for row in rows] == [
-        ("5.0", "2", "246.0"), ("25.0", "2", "47.0"),
+    columns = ("controller.kx", "runs", "settle_1cm_steps_p50", "verdict")
+    assert [tuple(row[name] for name in columns) for row in rows] == [
+        ("5.0", "2", "246.0", "asymptotic"), ("25.0", "2", "47.0", "asymptotic"),
     ]  # fmt: skip
     assert (tmp_path / "out" / "iae.png").exists()
     assert "246" in done.output
@@ -378,7 +405,7 @@ def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(
 ) -> None:
     arguments = (
         "sweep", PAPER, *(f"--set={setting}" for setting in BERNOULLI[:2]), "--vary=controller.kx=5:60:40",
-        "--seeds=48", "--workers=1", "--out",
+        "--seeds=48", "--workers=1", "--no-verdicts", "--out",
     )  # fmt: skip
     started = start("agv_analysis.cli", *map(str, (*arguments, tmp_path / "stopped")))
     started.until(lambda: any((tmp_path / "stopped").glob("parts/*.npy")))
