@@ -44,6 +44,18 @@ class _OwnErrorDetectorParameters(LoopParameters):
         0.2, "track path: how far before a corner, at most, the arc begins that rounds it", unit="m", above=0.0,
         high=100.0,
     )  # fmt: skip
+    corridor: float = parameter(
+        0.0,
+        "largest distance of the AGV from its reference that the analysis allows, 0: no corridor; the nodes do not use "
+        "it",
+        unit="m", low=0.0, high=1e6,
+    )  # fmt: skip
+    corridor_along: float = parameter(
+        0.0,
+        "largest deviation along the track, for a corridor that is longer or shorter than it is wide: corridor is then "
+        "its half-width across the track; 0: corridor bounds the distance in every direction",
+        unit="m", low=0.0, high=1e6,
+    )  # fmt: skip
     policy: str = parameter(
         "hold",
         "what an outdated pose is compared with; hold: the reference of now, align: that of its instant, predict: it "

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agv_analysis.bags import Bag, read_bag
+    from agv_analysis.corridor.corridor import Corridor, corridor
     from agv_analysis.report.page import write_report
     from agv_analysis.run import Run
     from agv_analysis.runtime.outcome import Outcome
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Analysis",
     "Bag",
+    "Corridor",
     "Margins",
     "Observations",
     "Outcome",
@@ -56,6 +58,7 @@ __all__ = [
     "analyse",
     "channels",
     "control_laws",
+    "corridor",
     "load_scenario",
     "margins",
     "observe",
@@ -97,6 +100,8 @@ _MODULES = {
     "Observations": "agv_analysis.stability.analysis",
     "margins": "agv_analysis.stability.margins",
     "Margins": "agv_analysis.stability.margins",
+    "corridor": "agv_analysis.corridor.corridor",
+    "Corridor": "agv_analysis.corridor.corridor",
     "write_report": "agv_analysis.report.page",
     "control_laws": "agv_ncs._parts",
     "vehicles": "agv_ncs._parts",

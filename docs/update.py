@@ -102,8 +102,8 @@ def api_types() -> str:
     import agv_ncs
 
     types = (
-        agv_ncs.Run, agv_ncs.Observations, agv_ncs.Analysis, agv_ncs.Margins, agv_ncs.Bag, agv_ncs.SweepResult,
-        agv_ncs.Outcome, agv_ncs.Quantity,
+        agv_ncs.Run, agv_ncs.Observations, agv_ncs.Analysis, agv_ncs.Margins, agv_ncs.Corridor, agv_ncs.Bag,
+        agv_ncs.SweepResult, agv_ncs.Outcome, agv_ncs.Quantity,
     )  # fmt: skip
     return "\n".join(
         f"### {kind.__name__}\n\n{first_line(kind)}\n\n| field | type | meaning |\n|---|---|---|\n"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from agv_analysis.scenario import Scenario
     from agv_analysis.stability.analysis import Observations
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -23,6 +24,56 @@ def with_settings(command: F) -> F:
         help="Change a parameter of the file, as in --set relay.uplink.p=0.05. May be repeated.",
     )(command)  # fmt: skip
     return click.argument("params", type=click.Path())(command)
+
+
+def with_corridor(command: F) -> F:
+    """The options of commands that say what a loop does within a corridor."""
+    command = click.option(
+        "--laps", type=click.IntRange(1), help="How many laps are simulated for that; by default some hundred."
+    )(command)
+    command = click.option(
+        "--corridor-along", type=click.FloatRange(min=0.0, min_open=True), metavar="D",
+        help="Allow so much [m] along the track; --corridor is then the half-width across it.",
+    )(command)  # fmt: skip
+    return click.option(
+        "--corridor", "corridor_width", type=click.FloatRange(min=0.0, min_open=True), metavar="D",
+        help="Say which outages keep the AGV within D [m] of its reference, and how often it leaves that corridor; in "
+        "the params file: error_detector.corridor.",
+    )(command)  # fmt: skip
+
+
+def corridor_settings(width: float | None, along: float | None) -> tuple[str, ...]:
+    """The options of `with_corridor` as settings of a scenario."""
+    named = (("corridor", width), ("corridor_along", along))
+    return tuple(f"error_detector.{name}={value!r}" for name, value in named if value is not None)
+
+
+def print_corridor(analysis: Observations, scenario: Scenario, is_known: bool, laps: int | None) -> dict[str, Any]:
+    """Print what a run and its scenario say of the corridor, if there is one; returns it for --json.
+
+    `is_known`: the channel is the scenario's, else it is the one that fits the run.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from agv_analysis.corridor.corridor_of_run import corridor_of_run
+
+    with Console(stderr=True).status("within the corridor ...") as status:
+        found = corridor_of_run(
+            analysis, scenario, is_known, laps, lambda what: status.update(f"within the corridor: {what} ...")
+        )
+    if found is None:
+        return {}
+    console, table = Console(highlight=False), Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for name, value in found.rows():
+        table.add_row(name, escape(value))
+    console.print(table)
+    for note in found.notes:
+        console.print(f"[bold yellow]Corridor:[/] {escape(note)}.")
+    return {"corridor": found.to_json()}
 
 
 @contextmanager

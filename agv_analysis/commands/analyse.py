@@ -6,7 +6,14 @@ from pathlib import Path
 
 import click
 
-from agv_analysis.commands import report_on, with_report, write_json
+from agv_analysis.commands import (
+    corridor_settings,
+    print_corridor,
+    report_on,
+    with_corridor,
+    with_report,
+    write_json,
+)
 
 
 @click.command("analyse")
@@ -22,11 +29,13 @@ from agv_analysis.commands import report_on, with_report, write_json
 @click.option("--reference-topic", help="Another robot's reference: Odometry or Path.")
 @click.option("--track-file", type=click.Path(path_type=Path), help="Another robot's reference: CSV file with t, v, w.")
 @click.option("--topics", type=click.Path(path_type=Path), help="YAML file with the topics: pose, command, reference.")
+@with_corridor
 @with_report
 def command(
     bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None,
     pose_topic: str | None, command_topic: str | None, reference_topic: str | None, track_file: Path | None,
-    topics: Path | None, report: Path | None, figures: Path | None,
+    topics: Path | None, report: Path | None, figures: Path | None, corridor_width: float | None,
+    corridor_along: float | None, laps: int | None,
 ) -> None:  # fmt: skip
     """Say from the recording BAG whether the loop is stable, and why.
 
@@ -34,6 +43,7 @@ def command(
     Examples:
       agv-ncs analyse bags/first
       agv-ncs analyse bags/first --json first.json --picture first.png
+      agv-ncs analyse bags/first --corridor 0.5
       agv-ncs analyse bags/first --report first.html --figures first
       agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
       agv-ncs analyse robot --pose-topic /odom --command-topic /cmd_vel --reference-topic /plan
@@ -56,7 +66,9 @@ def command(
     where = picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png"))
     draw(run, where)
     print_table(analysis)
+    scenario = run.scenario.with_settings(corridor_settings(corridor_width, corridor_along), "--corridor")
+    within = print_corridor(analysis, scenario, False, laps) if run.gains_known else {}
     click.echo(f"bag:     {bag}\npicture: {where}")
     report_on(analysis, report, figures)
     if json_file is not None:
-        write_json(json_file, analysis.to_json())
+        write_json(json_file, {**analysis.to_json(), **within})

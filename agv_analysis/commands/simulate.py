@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import report_on, with_report, with_settings, write_json
+from agv_analysis.commands import (
+    corridor_settings,
+    print_corridor,
+    report_on,
+    with_corridor,
+    with_report,
+    with_settings,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,12 +28,16 @@ if TYPE_CHECKING:
 
 @click.command("simulate")
 @with_settings
+@with_corridor
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the run to this file, a row a step.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @with_report
 def command(
     params: str,
     settings: tuple[str, ...],
+    corridor_width: float | None,
+    corridor_along: float | None,
+    laps: int | None,
     csv_file: Path | None,
     json_file: Path | None,
     report: Path | None,
@@ -37,6 +49,7 @@ def command(
     Examples:
       agv-ncs simulate config/paper.yaml
       agv-ncs simulate config/outages.yaml --set controller.kx=250.0 --set relay.seed=7 --json fast.json
+      agv-ncs simulate config/outages.yaml --corridor 0.5
       agv-ncs simulate config/paper.yaml --set error_detector.track=eight --csv eight.csv
     """
     from agv_analysis.report.table import print_table
@@ -44,15 +57,17 @@ def command(
     from agv_analysis.simulation.single import simulate
     from agv_analysis.stability.analysis import analyse
 
-    run = simulate(load_scenario(params, settings))
+    scenario = load_scenario(params, (*settings, *corridor_settings(corridor_width, corridor_along)))
+    run = simulate(scenario)
     analysis = analyse(run)
     print_table(analysis)
+    within = print_corridor(analysis, scenario, True, laps)
     if csv_file is not None:
         write_csv(csv_file, run)
         click.echo(f"csv:     {csv_file}")
     report_on(analysis, report, figures)
     if json_file is not None:
-        write_json(json_file, analysis.to_json())
+        write_json(json_file, {**analysis.to_json(), **within})
 
 
 COLUMNS = (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import with_settings, write_json
+from agv_analysis.commands import corridor_settings, with_corridor, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.scenario import Scenario
@@ -29,6 +29,7 @@ _SEEDS = 20
 
 @click.command("stability")
 @with_settings
+@with_corridor
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
@@ -42,6 +43,9 @@ _SEEDS = 20
 def command(
     params: str,
     settings: tuple[str, ...],
+    corridor_width: float | None,
+    corridor_along: float | None,
+    laps: int | None,
     json_file: Path | None,
     axes: str | None,
     points: int,
@@ -54,12 +58,14 @@ def command(
     Examples:
       agv-ncs stability config/paper.yaml
       agv-ncs stability config/outages.yaml --set controller.kx=5.0 --set error_detector.track=line --json margins.json
+      agv-ncs stability config/outages.yaml --corridor 0.25
       agv-ncs stability config/paper.yaml --map kx,ts --csv map.csv --picture map.png
     """
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
+    from agv_analysis.corridor.corridor import corridor
     from agv_analysis.report.table import colour_of
     from agv_analysis.scenario import load_scenario
     from agv_analysis.stability.empirical import simulated_twins, too_short, with_an_end
@@ -69,7 +75,7 @@ def command(
     from agv_analysis.stability.twins_border import twins_border
     from agv_analysis.stability.verdict import decide
 
-    scenario = load_scenario(params, settings)
+    scenario = load_scenario(params, (*settings, *corridor_settings(corridor_width, corridor_along)))
     if axes is not None:
         _map(scenario, axes, points, csv_file or Path("map.csv"), picture or Path("map.png"))
         return
@@ -83,6 +89,7 @@ def command(
         found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
         evidence = evidence_of_scenario(scenario, twins.evidence)
         verdict = decide(evidence)
+        within = corridor(scenario, laps, lambda what: status.update(f"within the corridor: {what} ..."))
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
@@ -95,7 +102,8 @@ def command(
         said_of_twins += "; they come together, but the loop does not settle even without losses"
     elif not twins.is_long_enough and settles_without_losses(scenario):
         said_of_twins += f"; {too_short(twins.left_without_losses)}"
-    for name, value in (*found.rows(), ("Twins of this scenario, simulated", said_of_twins)):
+    of_corridor = () if within is None else within.rows()
+    for name, value in (*found.rows(), ("Twins of this scenario, simulated", said_of_twins), *of_corridor):
         table.add_row(name, escape(value))
     console.print(table)
     best, why_no_gain = _best_gains(scenario)
@@ -111,10 +119,13 @@ def command(
         console.print(f"[bold red]Infeasible:[/] {escape(found.infeasible)}.")
     for note in found.notes:
         console.print(f"[bold yellow]Loss-free motion:[/] {escape(note)}.")
+    for note in () if within is None else within.notes:
+        console.print(f"[bold yellow]Corridor:[/] {escape(note)}.")
     if found.left_out:
         console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
-        word = {**verdict.to_json(), "confidence": evidence.confidence}
+        word: dict[str, Any] = {**verdict.to_json(), "confidence": evidence.confidence}
+        word |= {} if within is None else {"corridor": within.to_json()}
         write_json(json_file, {**word, **found.to_json(), **_gains_to_json(best, why_no_gain)})
 
 

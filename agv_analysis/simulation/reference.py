@@ -34,6 +34,25 @@ def _reference(detector: ErrorDetectorParameters, steps: int, edition: object) -
     return points
 
 
+def repeated(rows: Floats, steps: int, ts: float) -> Floats:
+    """A reference, shape (n, 5), that goes on after its last row with the speeds from its first on, shape (steps, 5).
+
+    By Euler's steps of `ts` [s], as if it were driven again and again, whether it closes or not.
+    """
+    known = min(len(rows), steps)
+    speeds = np.resize(rows[:, 3:], (steps, 2))
+    x, y, theta = rows[known - 1, :3]
+    v, w = speeds[known - 1 : steps - 1].T
+    headings = theta + ts * np.concatenate(([0.0], np.cumsum(w)))
+    further = np.column_stack((
+        x + ts * np.cumsum(v * np.cos(headings[:-1])),
+        y + ts * np.cumsum(v * np.sin(headings[:-1])),
+        headings[1:],
+    ))  # fmt: skip
+    poses = np.concatenate((rows[:known, :3], further))
+    return np.ascontiguousarray(np.column_stack((poses, speeds)))
+
+
 def _edition(path: str) -> object:
     """What changes when a file does; None if there is no such file."""
     try:

@@ -30,6 +30,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links, link_that_holds
 from agv_analysis.simulation.loop import Loop, RunInputs, history
 from agv_analysis.simulation.parts import replacements_of, run_parts
+from agv_analysis.simulation.reference import repeated
 from agv_analysis.simulation.single import settings_of, start_of
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of
@@ -192,23 +193,8 @@ def _settles_without_losses(scenario: Scenario) -> bool:
 
 
 def _repeated_reference(scenario: Scenario, rows: Floats, count: int) -> Floats:
-    """X_r(k) and its speeds over the repetitions, and as far beyond as the edge looks ahead, shape (N, 5).
-
-    After the rows, shape (n, 5), the reference goes on with their speeds from the beginning, by Euler's steps.
-    """
-    steps, ts = len(rows), scenario.plant.ts
-    total = count * steps + scenario.controller.steps_ahead
-    speeds = np.resize(rows[:, 3:], (total, 2))
-    x, y, theta = rows[-1, :3]
-    v, w = speeds[steps - 1 : total - 1].T
-    headings = theta + ts * np.concatenate(([0.0], np.cumsum(w)))
-    further = np.column_stack((
-        x + ts * np.cumsum(v * np.cos(headings[:-1])),
-        y + ts * np.cumsum(v * np.sin(headings[:-1])),
-        headings[1:],
-    ))  # fmt: skip
-    poses = np.concatenate((rows[:, :3], further))
-    return np.ascontiguousarray(np.column_stack((poses, speeds)))
+    """X_r(k) and its speeds over the repetitions, and as far beyond as the edge looks ahead, shape (N, 5)."""
+    return repeated(rows, count * len(rows) + scenario.controller.steps_ahead, scenario.plant.ts)
 
 
 def _shifts(run: Run) -> tuple[int, ...]:

@@ -1,0 +1,229 @@
+"""What a loop does within a corridor: which outages it survives there, and how often it leaves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from agv_analysis.corridor.lap_loop import LapLoop
+from agv_analysis.corridor.leaving import Leaving, leaving
+from agv_analysis.corridor.outage_sequences import WorstSequence, largest_n
+from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, single_outage
+from agv_analysis.corridor.widths import Widths, widths_of
+from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.scenario import Scenario
+from agv_analysis.stability import joint_spectral_radius
+from agv_analysis.stability.error_dynamics import NoNominalMotionError
+from agv_analysis.stability.scenario_loop import loop_on_lap
+
+_PLACES = 500
+"""Places of the lap, at least, at which it is asked behind a predictor which repeated outages let an error grow."""
+
+_LONGEST_ANY = 500
+"""Longest outages that are tried in sequences."""
+
+
+@dataclass(frozen=True)
+class Corridor:
+    """The answers of a scenario."""
+
+    widths: Widths
+    ts: float
+    """Sampling period T_s [s]."""
+    single: SingleOutage | None
+    """None where outages alone are not what the loop meets; `reason` says why."""
+    sequence: WorstSequence | None
+    """The sequence of outages that leaves the corridor first, or that comes nearest to it."""
+    n_any: int | None
+    """Largest n for which no sequence of outages of up to n slots was found that leaves; None: with all that were
+    tried."""
+    n_any_reason: str
+    leaving: Leaving
+    lap_slots: int
+    """Slots of a lap."""
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def n_single(self) -> int | None:
+        """Longest single outage [slots] from anywhere on the lap with which the AGV stays inside; -1: not without any.
+
+        None: it did with all that were tried, or nothing is known.
+        """
+        return None if self.single is None else self.single.n
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Name and value of each figure, in plain text."""
+        yield "Corridor", _widths(self.widths)
+        if self.single is None:
+            yield "Outages within it", f"no answer: {self.reason}"
+        else:
+            yield "Longest single outage", self._single(self.single)
+            yield "Any outages up to n", self._any()
+        yield "Probability to leave", self._probability()
+        yield "Mean time to leave", _time(self.leaving.mean_time)
+
+    def _single(self, found: SingleOutage) -> str:
+        if found.n is None:
+            return f"all up to {LONGEST} slots stay inside, at most {found.deviation:.3g} m off"
+        if found.n < 0:
+            return "none: the AGV is outside without any"
+        where = f"({found.x:.3g}, {found.y:.3g}) m, {found.step * self.ts:.4g} s into the lap"
+        length = f"{found.n} slots ({found.n * self.ts * 1e3:g} ms)"
+        return f"{length}, which leads {found.deviation:.3g} m off at most; worst at {where}"
+
+    def _any(self) -> str:
+        if self.n_any is None:
+            return f"no sequence found that leaves ({self.n_any_reason})"
+        if self.n_any < 0:
+            return "none: the AGV is outside without any"
+        return f"no sequence found that leaves up to {self.n_any} slots; {self.n_any_reason}"
+
+    def _probability(self) -> str:
+        lap, hour = self.leaving.p_lap, self.leaving.p_hour
+        return f"{_percent(lap)} a lap, {_percent(hour)} an hour (by {self.leaving.method})"
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; SI units, intervals of 95 %."""
+        found, sequence, single = self.leaving, self.sequence, self.single
+        return {
+            "half_width": self.widths.half_width,
+            "half_width_along": _finite(min(self.widths.distance, self.widths.along)),
+            "n_single": self.n_single,
+            "n_single_reason": self._why_no_single(),
+            "single_deviation": None if single is None else _finite(single.deviation),
+            "worst_place": None if single is None else {
+                "step": single.step, "time_s": single.step * self.ts, "x": single.x, "y": single.y,
+            },
+            "n_any": self.n_any,
+            "n_any_reason": self.n_any_reason or None,
+            "worst_sequence": None if sequence is None else {
+                "outages": sequence.lengths, "step": sequence.step, "deviation": _finite(sequence.deviation),
+            },
+            **_estimates("p_lap", found.p_lap),
+            **_estimates("p_hour", found.p_hour),
+            **_estimates("mean_time_s", found.mean_time),
+            "method": found.method,
+            "laps": len(found.largest),
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+    def _why_no_single(self) -> str | None:
+        if self.single is None:
+            return self.reason
+        return f"all that were tried, up to {LONGEST} slots, stay inside" if self.single.n is None else None
+
+
+def corridor(
+    scenario: Scenario, laps: int | None = None, progress: Callable[[str], None] = lambda what: None
+) -> Corridor | None:
+    """What a scenario's loop does within its corridor; None if it has none.
+
+    `laps` are simulated, or as many as usual. Raises TrackFileError if the track's file cannot be used, PartError if a
+    part raises.
+    """
+    widths = widths_of(scenario.error_detector)
+    if widths is None:
+        return None
+    loop, single, sequence, n_any, why, reason = LapLoop(scenario, widths), None, None, None, "", ""
+    if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
+        reason = "messages take time or depend on the place, so that there are not outages alone"
+    elif not math.isfinite(loop.loss_free_share):
+        reason = "the loop does not settle even without losses"
+    else:
+        progress("single outages")
+        single = single_outage(loop)
+        progress("sequences of outages")
+        n_any, sequence, why = _any_outages(loop, single)
+    progress("laps")
+    found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"))
+    return Corridor(
+        widths, loop.ts, single, sequence, n_any, why, found, loop.steps, reason, tuple(_notes(loop, single))
+    )
+
+
+def _any_outages(loop: LapLoop, single: SingleOutage) -> tuple[int | None, WorstSequence | None, str]:
+    """Largest n at which no sequence was found that leaves, the worst sequence, and why it is that n."""
+    if single.n == -1:
+        return -1, None, "the AGV is outside without any"
+    longest = _LONGEST_ANY if single.n is None else min(single.n, _LONGEST_ANY)
+    growing = _growing(loop, longest)
+    n, sequence = largest_n(loop, longest if growing is None else min(longest, growing - 1))
+    if growing is not None and n == growing - 1:
+        return n, sequence, f"with outages of {growing} slots, again and again, a small error does not die out"
+    if single.n is None and n == longest:
+        return None, sequence, f"tried up to {longest} slots"
+    if n == single.n:
+        return n, sequence, "no more than of a single one"
+    return n, sequence, f"outages of {_turns(sequence.lengths)} slots leave"
+
+
+def _turns(lengths: list[int]) -> str:
+    one, other = lengths[0], lengths[1]
+    return f"{one}" if one == other else f"{one} and {other}"
+
+
+def _growing(loop: LapLoop, longest: int) -> int | None:
+    """Smallest n up to `longest` whose repetition lets a small error grow; None if none does, or if it is not known."""
+    try:
+        linear = loop_on_lap(loop.scenario)
+    except NoNominalMotionError:
+        return None
+    if linear.is_exact:  # an outage leaves nothing that could grow
+        return None
+    return joint_spectral_radius.first_refuted(linear.thinned(_PLACES) if linear.predicts else linear, longest)
+
+
+def _notes(loop: LapLoop, single: SingleOutage | None) -> Iterator[str]:
+    share, policy = loop.loss_free_share, loop.scenario.error_detector.policy
+    if share > 1.0 and math.isfinite(share):
+        yield f"without any outage the AGV uses {share:.3g} times the half-width: no outage can be survived in it"
+    elif single is not None and single.n == 0 and policy == "hold":
+        yield (
+            "a single lost pose leads outside: an outdated pose is compared with the reference of now "
+            "(error_detector.policy is hold), which align and predict do not do"
+        )
+
+
+def _widths(widths: Widths) -> str:
+    if math.isfinite(widths.distance):
+        return f"{widths.distance:g} m about the reference"
+    return f"{widths.across:g} m across the track, {widths.along:g} m along it"
+
+
+def _percent(p: Estimate) -> str:
+    if p.low == p.high:
+        return f"{p.value:.4g}"
+    return f"{p.value:.3g} ({p.low:.3g} .. {p.high:.3g})"
+
+
+def _time(mean: Estimate | None) -> str:
+    if mean is None:
+        return "it never leaves"
+    if not math.isfinite(mean.value):
+        return f"more than {_seconds(mean.low)}"
+    if mean.low == mean.high:
+        return _seconds(mean.value)
+    return f"{_seconds(mean.value)} ({_seconds(mean.low)} .. {_seconds(mean.high)})"
+
+
+_UNITS = ((3.156e7, "years"), (86400.0, "days"), (3600.0, "h"), (60.0, "min"))
+
+
+def _seconds(value: float) -> str:
+    if math.isinf(value):
+        return "any time"
+    return next((f"{value / size:.3g} {unit}" for size, unit in _UNITS if value >= 2.0 * size), f"{value:.3g} s")
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if math.isfinite(value) else None
+
+
+def _estimates(name: str, found: Estimate | None) -> dict[str, Any]:
+    if found is None:
+        return {name: None, f"{name}_interval": None}
+    return {name: _finite(found.value), f"{name}_interval": [_finite(found.low), _finite(found.high)]}

@@ -1,0 +1,189 @@
+"""How often the loop leaves its corridor under the channel of its scenario, and how long it takes to.
+
+First whole laps are simulated, each with outcomes, noise and slip of its own: that knows every channel, delays and both
+links. Where few of them leave, and the channel is a Markov chain, importance splitting says how rare it is.
+
+A lap begins with the AGV on the loss-free motion, or where that is not the reference, with a lap that is not looked at.
+Laps count as independent of each other: what an outage leaves is over long before the next lap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agv_analysis.compiled import numbers
+from agv_analysis.corridor.lap_loop import LapLoop
+from agv_analysis.corridor.rare_leaving import leaving_rate
+from agv_analysis.corridor.shares import path_shares
+from agv_analysis.corridor.single_outage import SingleOutage
+from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.link.markov_channel import Chain, chain_of
+from agv_analysis.run import Floats
+from agv_analysis.simulation.batch import cores
+from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.simulation.loop import RunInputs, history
+from agv_analysis.simulation.parts import replacements_of, run_parts
+from agv_analysis.simulation.single import settings_of, simulate
+from agv_plant.vehicle.motion import NOISE, SLIP
+
+LAPS = 200
+"""Laps that are simulated, if they are of usual length."""
+
+_SLOTS, _FEWEST = 4_000_000, 40
+"""Slots that are simulated at most, but for so many laps."""
+
+ENOUGH = 40
+"""Laps that leave, with which nothing rarer is asked."""
+
+HOUR = 3600.0
+
+_ON_REFERENCE = 1e-3
+"""Share of the corridor up to which the loss-free motion is the reference."""
+
+
+@dataclass(frozen=True)
+class Leaving:
+    """How often the corridor is left; each figure with its 95 % interval."""
+
+    p_lap: Estimate
+    """Probability that a lap leaves it."""
+    p_hour: Estimate
+    mean_time: Estimate | None
+    """Mean time [s] until it is left; its upper end may be inf. None: it is never left."""
+    method: str
+    """How this is known, in words."""
+    largest: Floats
+    """Largest share of the corridor that each of the simulated laps used, shape (laps,); inf where one diverged."""
+
+
+def leaving(
+    loop: LapLoop, single: SingleOutage | None, laps: int | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Leaving:  # fmt: skip
+    """How often a scenario's loop leaves its corridor. `single`: what one outage does to it, where that is known."""
+    laps = laps or max(_FEWEST, min(LAPS, _SLOTS // loop.steps))
+    runs = list(_laps(loop, laps, progress))
+    largest = np.array([found for found, _ in runs])
+    left, driven = int((largest > 1.0).sum()), float(sum(steps for _, steps in runs)) * loop.ts
+    if len(runs) < laps:
+        return _certain(loop, runs[0], largest)
+    share = Estimate.of(left, laps)
+    chain = _chain(loop)
+    if left < ENOUGH and chain is not None and single is not None and single.n is not None and single.n >= 0:
+        rate = leaving_rate(loop, chain, single.n, loop.scenario.relay.seed)
+        if 0.0 < rate.per_slot.value * loop.steps < _RARE:
+            return _of_rate(loop, rate.per_slot, largest, f"importance splitting with {rate.runs} runs")
+    return _of_laps(
+        loop, share, driven / left if left else None, largest, f"{laps} simulated laps, {left} of which left it"
+    )
+
+
+_RARE = 0.2
+"""Expected number of times a lap up to which they count as independent of each other."""
+
+
+def _of_laps(loop: LapLoop, p: Estimate, mean: float | None, largest: Floats, method: str) -> Leaving:
+    lap = loop.steps * loop.ts
+    per_hour = Estimate(*(_within(value, HOUR / lap) for value in (p.value, p.low, p.high)))
+    if mean is None:
+        low = -lap / math.log1p(-p.high)
+        return Leaving(p, per_hour, Estimate(math.inf, low, math.inf), method, largest)
+    high = mean * p.value / p.low if p.low > 0.0 else math.inf
+    return Leaving(p, per_hour, Estimate.about(mean, mean * p.value / p.high, high), method, largest)
+
+
+def _within(p: float, times: float) -> float:
+    """Probability that what happens with probability p in one of some equal times happens in any of them."""
+    return -math.expm1(times * math.log1p(-p)) if p < 1.0 else 1.0
+
+
+def _of_rate(loop: LapLoop, rate: Estimate, largest: Floats, method: str) -> Leaving:
+    lap, hour, ends = loop.steps, HOUR / loop.ts, (rate.value, rate.low, rate.high)
+    p_lap, p_hour = (Estimate(*(-math.expm1(-value * slots) for value in ends)) for slots in (lap, hour))
+    times = [loop.ts / value if value > 0.0 else math.inf for value in (rate.value, rate.high, rate.low)]
+    return Leaving(p_lap, p_hour, Estimate(*times), method, largest)
+
+
+def _certain(loop: LapLoop, run: tuple[float, int], largest: Floats) -> Leaving:
+    """Nothing is random: one lap says it all."""
+    leaves = float(run[0] > 1.0)
+    p = Estimate(leaves, leaves, leaves)
+    mean = Estimate(*(run[1] * loop.ts,) * 3) if leaves else None
+    return Leaving(p, p, mean, "nothing is random: one lap shows it", largest)
+
+
+def _chain(loop: LapLoop) -> Chain | None:
+    """The uplink as a chain, where it alone loses messages and none comes late."""
+    uplink, downlink = loop.scenario.relay.uplink, loop.scenario.relay.downlink
+    is_alone = uplink.is_direct and downlink.is_direct and downlink.model == "perfect" and not downlink.schedule
+    chain = chain_of(uplink) if is_alone else None
+    return chain if chain is not None and 0.0 < chain.loss_rate < 1.0 else None
+
+
+def _laps(loop: LapLoop, laps: int, progress: Callable[[int], None]) -> Iterator[tuple[float, int]]:
+    """Of each lap the largest share of the corridor and the steps until it was left; of one lap if all are equal."""
+    scenario, drive = loop.scenario, _direct_lap
+    if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
+        drive = _simulated_lap
+    loop.reference(2 * loop.steps)
+    skipped = 0 if loop.loss_free_share < _ON_REFERENCE else loop.steps
+    first = scenario.relay.seed
+    if not _is_random(loop):
+        yield drive(loop, first, skipped)
+        return
+    with ThreadPoolExecutor(cores()) as pool:
+        for done, found in enumerate(pool.map(lambda i: drive(loop, first + i, skipped), range(laps)), start=1):
+            progress(done)
+            yield found
+
+
+def _is_random(loop: LapLoop) -> bool:
+    """Do noise, slip or a link depend on the seed?"""
+    plant, relay = loop.scenario.plant, loop.scenario.relay
+    links = (relay.uplink, relay.downlink)
+    if plant.is_noisy or plant.slip_noise > 0.0 or any(link.is_placed or link.jitter > 0.0 for link in links):
+        return True
+    one, other = (ChannelRealisation(relay.seed + i, loop.steps, loop.ts) for i in range(2))
+    return any(
+        not np.array_equal(one.outcomes(link, name), other.outcomes(link, name))
+        for name, link in (("uplink", relay.uplink), ("downlink", relay.downlink))
+    )
+
+
+def _direct_lap(loop: LapLoop, seed: int, skipped: int) -> tuple[float, int]:
+    scenario, steps = loop.scenario, skipped + loop.steps
+    plant, relay, drawn = scenario.plant, scenario.relay, ChannelRealisation(seed, steps, loop.ts)
+    inputs = RunInputs(
+        numbers(drawn.outcomes(relay.uplink, "uplink")), numbers(drawn.outcomes(relay.downlink, "downlink")),
+        loop.start(), settings_of(scenario),
+        numbers(drawn.normals(NOISE)) if plant.is_noisy else None,
+        numbers(drawn.normals(SLIP)) if plant.slip_noise > 0.0 else None,
+    )  # fmt: skip
+    rows, n_ul = np.full((steps, 8), math.nan), np.empty(steps, dtype=np.int64)
+    reference = loop.reference(2 * loop.steps)
+    run_parts(history, replacements_of(scenario), numbers(reference), inputs, rows, n_ul)
+    return _largest(loop, rows[skipped:, :3], reference[skipped:steps])
+
+
+def _simulated_lap(loop: LapLoop, seed: int, skipped: int) -> tuple[float, int]:
+    scenario = loop.scenario
+    plant = replace(
+        scenario.plant, seed=seed, initial_pose=scenario.error_detector.track_start,
+        duration=(skipped + loop.steps) * loop.ts, clock="lockstep",
+    )  # fmt: skip
+    run = simulate(replace(scenario, plant=plant, relay=replace(scenario.relay, seed=seed)))
+    pose = np.full((skipped + loop.steps, 3), math.nan)
+    pose[: len(run)] = run.pose
+    reference = loop.reference(2 * loop.steps)
+    return _largest(loop, pose[skipped:], reference[skipped : len(pose)])
+
+
+def _largest(loop: LapLoop, pose: Floats, reference: Floats) -> tuple[float, int]:
+    shares = path_shares(pose, reference, loop.widths)
+    outside = np.flatnonzero(shares > 1.0)
+    return float(shares.max()), int(outside[0]) if len(outside) else len(shares)

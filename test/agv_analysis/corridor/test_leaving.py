@@ -1,0 +1,72 @@
+"""How often the corridor is left, against theory and against laps that are simulated one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from agv_analysis.corridor.lap_loop import LapLoop
+from agv_analysis.corridor.leaving import Leaving, leaving
+from agv_analysis.corridor.rare_leaving import leaving_rate
+from agv_analysis.corridor.shares import path_deviation
+from agv_analysis.corridor.single_outage import single_outage
+from agv_analysis.corridor.widths import Widths
+from agv_analysis.link.markov_channel import gilbert_elliott
+from agv_analysis.simulation import simulate
+from test.agv_analysis.corridor.test_single_outage import scenario
+
+
+def of(half_width: float, *settings: str, laps: int = 100) -> Leaving:
+    loop = LapLoop(scenario(*settings), Widths(half_width, math.inf, math.inf))
+    return leaving(loop, single_outage(loop), laps)
+
+
+def test_laps_are_those_of_the_simulation() -> None:
+    chosen = scenario("plant.noise_xy=0.01", "relay.downlink.model=bernoulli", "relay.downlink.p=0.1")
+    plant = dataclasses.replace(chosen.plant, initial_pose=chosen.error_detector.track_start, duration=10.0)
+    farthest = []
+    for seed in range(1, 9):
+        run = simulate(
+            dataclasses.replace(
+                chosen, plant=dataclasses.replace(plant, seed=seed), relay=dataclasses.replace(chosen.relay, seed=seed)
+            )
+        )
+        farthest.append(np.hypot(*path_deviation(run.pose, run.reference)).max())
+    loop = LapLoop(chosen, Widths(0.2, math.inf, math.inf))
+    np.testing.assert_allclose(leaving(loop, None, laps=8).largest * 0.2, farthest, rtol=1e-6)
+
+
+def test_splitting_gives_what_simulated_laps_give() -> None:
+    """On a line the shortest outage that leaves 0.25 m has 28 slots; the rate of such outages is known."""
+    loop = LapLoop(scenario("error_detector.track=line"), Widths(0.25, math.inf, math.inf))
+    rate = leaving_rate(loop, gilbert_elliott(0.02, 0.2), 27, seed=1).per_slot
+    assert rate.high < 1.5 * rate.low
+    of_long_outages = 0.02 * 0.2 / 0.22 * 0.8**27  # others end in the wake of one that was nearly long enough
+    assert 0.75 * of_long_outages < rate.value < 1.1 * of_long_outages
+    laps = of(0.25, "error_detector.track=line", laps=400)
+    p = -math.expm1(-rate.value * 2000)
+    assert laps.p_lap.low <= p <= laps.p_lap.high
+
+
+def test_rare_events_are_asked_of_splitting() -> None:
+    found = of(0.6, "error_detector.track=line")
+    assert "splitting" in found.method
+    assert found.p_lap.value == pytest.approx(0.02 * 0.2 / 0.22 * 0.8**43 * 2000, rel=0.3)
+    assert found.p_lap.low < found.p_lap.value < found.p_lap.high
+    assert found.p_hour.value == pytest.approx(1.0 - (1.0 - found.p_lap.value) ** 360, rel=1e-6)
+    assert found.mean_time is not None
+    assert found.mean_time.value == pytest.approx(10.0 / found.p_lap.value, rel=0.01)
+
+
+def test_what_is_not_random_is_asked_of_one_lap() -> None:
+    perfect = of(0.25, "relay.uplink.model=perfect")
+    assert (perfect.p_lap.high, perfect.p_hour.high, perfect.mean_time) == (0.0, 0.0, None)
+    never = of(0.25, "relay.uplink.model=bernoulli", "relay.uplink.p=1.0", "error_detector.track=line")
+    assert (never.p_lap.low, never.p_hour.low) == (1.0, 1.0)
+    assert never.mean_time is not None
+    assert never.mean_time.value == pytest.approx(29 * 0.005)  # the 28th loss in a row leads outside
+    delayed = of(0.02, "relay.uplink.model=perfect", "relay.uplink.delay=0.05", "error_detector.track=line")
+    assert delayed.p_lap.low == 1.0  # v n T_s = 5 cm off for ever
