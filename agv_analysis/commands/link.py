@@ -205,7 +205,7 @@ def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
 
     verdict = driven.verdict
     console.print(
-        f"The loop {how}: [bold {colour_of(verdict)}]{verdict.word}[/], {escape(verdict.reason)}", soft_wrap=True
+        f"The loop {how}: [bold {colour_of(verdict.word)}]{verdict.word}[/], {escape(verdict.reason)}", soft_wrap=True
     )
     largest, count = float(driven.deviations.max()), len(driven.deviations)
     runs = f"a run of {driven.seconds:g} s" if count == 1 else f"{count} runs of {driven.seconds:g} s"
