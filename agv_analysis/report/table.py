@@ -11,6 +11,7 @@ from agv_analysis.metrics.convergence import Convergence
 from agv_analysis.metrics.deviation import DIVERGED, Deviation, Peak
 from agv_analysis.metrics.last_excursion import LastExcursion
 from agv_analysis.metrics.outages import loss_causes
+from agv_analysis.report.verdict_sentence import in_short
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.margins import margins
@@ -28,21 +29,29 @@ _NOT_JUDGED = "not judged: messages are missing that no channel lost"
 
 
 def print_table(analysis: Observations) -> None:
-    """Print the figures, then one line for each disagreement between the criteria, then the notes."""
+    """Print the verdict in a frame, then the figures in groups, disagreements between the criteria, and notes."""
     from rich.console import Console
     from rich.markup import escape
+    from rich.panel import Panel
     from rich.table import Table
 
     console = Console(highlight=False)
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
-    for name, value in rows(analysis):
-        table.add_row(name, value)
     for topic, count in analysis.run.unexplained.items():
         console.print(
             f"[bold red]Invalid:[/] {count} messages of {escape(topic)} are missing, and no channel lost them."
         )
+    frame = Table.grid(padding=(0, 2))
+    frame.add_column(style="bold")
+    for name, value in headline_rows(analysis):
+        frame.add_row(name, value)
+    console.print(Panel(frame, expand=False))
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for title, group in grouped_rows(analysis):
+        table.add_row(f"[dim]{title}[/]")
+        for name, value in group:
+            table.add_row(f"  {name}", value)
     console.print(table)
     for sentence in _disagreements(analysis):
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
@@ -72,6 +81,52 @@ def print_side_by_side(analyses: Mapping[str, Observations]) -> None:
 
 def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     """Name and value of each figure, as text with rich's markup."""
+    for _, group in grouped_rows(analysis):
+        yield from group
+
+
+def headline_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
+    """The verdict, how far the AGV strays and how much more it can take, each in a short line with rich's markup."""
+    from rich.markup import escape
+
+    if analysis.run.unexplained or not isinstance(analysis, Analysis):
+        yield "Verdict", f"[bold yellow]none[/]: {in_short(analysis)}"
+    else:
+        verdict, said = analysis.verdict, in_short(analysis)
+        yield "Verdict", f"[bold {colour_of(verdict.word)}]{said[0].upper()}{said[1:]}[/]"
+        if verdict.word not in GREEN:
+            yield "Because", escape(verdict.reason)
+    yield "Deviation", _deviation_in_short(analysis.deviation)
+    if isinstance(analysis, Analysis) and not analysis.run.unexplained and analysis.verdict.word in GREEN:
+        yield "Margin", escape(analysis.verdict.margin)
+
+
+def _deviation_in_short(found: Deviation) -> str:
+    """The largest deviation with its outage."""
+    if not found.worst:
+        return metres(found.largest) if found.is_diverged else f"{at_most(found.largest)}, RMS {metres(found.rms)}"
+    worst = found.worst[0]
+    after = "" if worst.outage is None else f", after an outage of {worst.outage.slots} slots"
+    return f"{at_most(worst.distance)}, at {worst.seconds:g} s{after}"
+
+
+def grouped_rows(analysis: Observations) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """The figures in groups: title, and name and value of each."""
+    yield "Link", list(_link_rows(analysis))
+    yield (
+        "Motion",
+        [*convergence_rows(analysis.convergence, 1e3 * analysis.run.ts), *deviation_rows(analysis.deviation)],
+    )
+    if analysis.run.unexplained:
+        yield "Criteria", [("Stability", _NOT_JUDGED)]
+    elif isinstance(analysis, Analysis):
+        yield "Criteria", list(_criteria(analysis))
+    else:
+        yield "Criteria", [("Stability", f"not judged: {GAINS_UNKNOWN}")]
+
+
+def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
+    """What the radio did."""
     run, up = analysis.run, analysis.outages.uplink
     ms = 1e3 * run.ts
     seed = f", seed {run.scenario.relay.seed}" if run.seed_known else ""
@@ -97,15 +152,7 @@ def rows(analysis: Observations) -> Iterator[tuple[str, str]]:
             "Downlink",
             f"{down.loss_rate:.2%} lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
         )
-    yield from convergence_rows(analysis.convergence, ms)
-    yield from deviation_rows(analysis.deviation)
     yield "Fitted channel", _fit(analysis)
-    if run.unexplained:
-        yield "Stability", _NOT_JUDGED
-    elif isinstance(analysis, Analysis):
-        yield from _criteria(analysis)
-    else:
-        yield "Stability", f"not judged: {GAINS_UNKNOWN}"
 
 
 def _disagreements(analysis: Observations) -> list[str]:

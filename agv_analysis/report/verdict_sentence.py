@@ -44,6 +44,30 @@ def sentence(analysis: Observations) -> str:
     return f"The AGV does not keep to its track: {met} are too much for these gains."
 
 
+def in_short(analysis: Observations) -> str:
+    """The verdict in half a line, for people who know the criteria."""
+    if analysis.run.unexplained:
+        return "messages are missing that no channel lost"
+    if not isinstance(analysis, Analysis):
+        return GAINS_UNKNOWN
+    n, n_bursts, word = analysis.n, analysis.evidence.n_bursts, analysis.verdict.word
+    if word == ASYMPTOTIC and n == 0:
+        return "stable; no update was lost"
+    if word == ASYMPTOTIC and _is_late(analysis):
+        return f"stable with poses {n} steps old"
+    if word == ASYMPTOTIC:
+        return f"stable under any outages of up to {n} slots"
+    if word == MEAN_SQUARE and n_bursts is not None and n > n_bursts:
+        return f"stable in mean square; not guaranteed for the longest outage seen ({n})"
+    return {
+        MEAN_SQUARE: "stable in mean square",
+        BOUNDED: "bounded; only the speed limit bounds the error",
+        UNDECIDED: "undecided; too little was seen of the link",
+        INFEASIBLE: "infeasible; the loop does not settle even without losses",
+        UNKNOWN: "unknown",
+    }.get(word, "unstable; the error grows")
+
+
 def _in_mean_square(analysis: Analysis, met: str) -> str:
     n_bursts = analysis.evidence.n_bursts
     if n_bursts is None or analysis.n <= n_bursts:

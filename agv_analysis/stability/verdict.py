@@ -155,14 +155,11 @@ def _by_criteria(evidence: Evidence) -> Verdict:
     if evidence.growth >= 0.0:
         return _not_stable(evidence, evidence.growth_of, _grows(evidence))
     if evidence.growth_of == "mean_square" and is_survived and not evidence.is_unlimited:
-        left = "any number of" if evidence.n_bursts is None else str(evidence.n_bursts - evidence.n)
-        left = "at least " + left if evidence.is_least else left
-        plural = "s" if evidence.n_bursts is None or evidence.n_bursts - evidence.n != 1 else ""
         reason = f"any sequence of outages of up to {evidence.n} slots is survived"
         if evidence.n == 0:
             reason = "no update was lost, and the error dies out"
         sure = f"; {_of_link(evidence)}" if evidence.link is not None else ""
-        return Verdict(ASYMPTOTIC, "bursts", f"{left} more consecutive outage{plural}", reason + sure)
+        return Verdict(ASYMPTOTIC, "bursts", _limit(evidence), reason + sure)
     return _mean_square(evidence)
 
 
@@ -173,7 +170,7 @@ def _mean_square(evidence: Evidence) -> Verdict:
     elif evidence.growth_of != "mean_square":
         margin = "messages were late; under ages like these the mean square of the error dies out"
     else:
-        margin = _beyond(evidence)
+        margin = _limit(evidence)
         if evidence.burst_left is not None:
             margin += f"; outages may become {evidence.burst_left:.3g} times as long on average"
     return Verdict(MEAN_SQUARE, evidence.growth_of, margin, reason)
@@ -222,16 +219,14 @@ def _grows(evidence: Evidence) -> str:
     return "under this link the mean square of the error grows"
 
 
-def _beyond(evidence: Evidence) -> str:
+def _limit(evidence: Evidence) -> str:
+    """The longest outage that was seen, and that which is survived in any order."""
+    seen = f"longest outage: {evidence.n}"
     if evidence.is_unlimited:
-        return "outages of such a link have no longest one"
-    if evidence.n_bursts is None or evidence.n <= evidence.n_bursts:
-        return "any sequence of the outages seen is survived"
-    if evidence.is_least:
-        return "the longest outage is not proved to be survived in any order"
-    longer = evidence.n - evidence.n_bursts
-    slots = f"{longer} slot{'s' if longer != 1 else ''}"
-    return f"the longest outage is {slots} longer than what the loop survives in any order"
+        seen = "outages of such a link have no longest one"
+    if evidence.n_bursts is None:
+        return f"{seen}; outages of any length are survived"
+    return f"{seen}; guaranteed limit: {'at least ' if evidence.is_least else ''}{evidence.n_bursts}"
 
 
 def _against_stability(evidence: Evidence) -> str:

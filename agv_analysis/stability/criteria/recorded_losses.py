@@ -14,10 +14,17 @@ def _judge(facts: RunFacts) -> Judgement | None:
     of_losses, of_motion = _contractions(facts) if facts.is_feasible else (None, None)
     values = {"floquet_multiplier_per_step": of_losses, "contraction_per_step": of_motion}
     if of_losses is None:
-        return Judgement("These very losses", None, "", values)
-    motion = "" if of_motion is None else f", {of_motion:.6g} about the motion"
-    why = f"times {of_losses:.6g} a step about the reference{motion}"
-    return Judgement("These very losses", of_losses < 1.0, why, values, (of_losses, of_motion))
+        return Judgement("Recorded losses", None, "", values)
+    why = f"errors {_per_step(of_losses)}"
+    if of_motion is not None:
+        why += f"; about the driven motion they {_per_step(of_motion)}"
+    return Judgement("Recorded losses", of_losses < 1.0, why, values, (of_losses, of_motion))
+
+
+def _per_step(factor: float) -> str:
+    """A growth factor per step in words."""
+    change = 100.0 * (factor - 1.0)
+    return f"{'grow' if change > 0.0 else 'shrink'} by {abs(change):.3g} % a step"
 
 
 def _contractions(facts: RunFacts) -> tuple[float | None, float | None]:
@@ -61,7 +68,7 @@ def _held_its_command(run: Run) -> bool:
 CRITERION = Criterion(
     key="recorded_losses",
     order=70,
-    title="These very losses",
+    title="Recorded losses",
     asks="What does the run's own sequence of losses do to a small error, if it comes again and again?",
     assumes="Nothing of the channel; it says of this one run only.",
     judge=_judge,

@@ -83,14 +83,17 @@ DRIFTS = dataclasses.replace(STAYS, stays=False, largest_deviation=40.0)
 @pytest.mark.parametrize(
     ("evidence", "word", "margin"),
     [
-        (Evidence(n=10, n_bursts=14, growth=-0.1), "asymptotic", "4 more consecutive outages"),
-        (Evidence(n=13, n_bursts=14, growth=-0.1), "asymptotic", "1 more consecutive outage"),
-        (Evidence(n=14, n_bursts=14, growth=-0.1), "asymptotic", "0 more consecutive outages"),
-        (Evidence(n=10, n_bursts=None, growth=-0.1), "asymptotic", "any number of more consecutive outages"),
+        (Evidence(n=10, n_bursts=14, growth=-0.1), "asymptotic", "longest outage: 10; guaranteed limit: 14"),
+        (Evidence(n=14, n_bursts=14, growth=-0.1), "asymptotic", "longest outage: 14; guaranteed limit: 14"),
+        (
+            Evidence(n=10, n_bursts=None, growth=-0.1),
+            "asymptotic",
+            "outages of any length are survived",
+        ),
         (
             Evidence(n=15, n_bursts=14, growth=-0.1, burst_left=2.0),
             "mean-square",
-            "1 slot longer than what the loop survives in any order; outages may become 2 times",
+            "longest outage: 15; guaranteed limit: 14; outages may become 2 times",
         ),
         (Evidence(n=10, n_bursts=14, growth=-0.1, is_unlimited=True), "mean-square", "no longest one"),
         (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0, repeated=STAYS), "bounded", "limit on the speed"),
@@ -145,7 +148,7 @@ def test_runs_on_both_sides_of_the_border_of_bursts() -> None:
     """K_x = 25 on a line: 14 lost in a row contract by |1 - 15/8| = 7/8 a burst, 16 grow by |1 - 17/8| = 9/8."""
     stable = of(*BURST_16, "relay.uplink.n=14")
     assert stable.verdict.word == "asymptotic"
-    assert stable.verdict.margin.startswith("0 more")
+    assert stable.verdict.margin == "longest outage: 14; guaranteed limit: 14"
     assert stable.floquet == pytest.approx(max(0.875 ** (1 / 15), _across(15)), rel=1e-6)
     unstable = of(*BURST_16)
     assert unstable.verdict.word == "unstable"
@@ -198,7 +201,7 @@ def test_a_downlink_policy_that_no_criterion_covers() -> None:
 
 def test_a_perfect_channel() -> None:
     found = of("plant.duration=10.0")
-    assert (found.verdict.word, found.verdict.margin) == ("asymptotic", "14 more consecutive outages")
+    assert (found.verdict.word, found.verdict.margin) == ("asymptotic", "longest outage: 0; guaranteed limit: 14")
     assert found.to_json()["channel_fit"]["model"] == "perfect"
     assert found.contraction is not None
     assert found.contraction < 1.0
