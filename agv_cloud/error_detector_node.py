@@ -69,7 +69,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         super().__init__("error_detector", ErrorDetectorParameters, **node_options)
         settings = self.settings
         self._detection = ErrorDetection(settings)
-        self._slots = SlotStepping(self.grid)
+        self._slots = SlotStepping(self.grid, settings.window_steps)
         self._timed = TimerStepping(self.grid, from_first_pose=settings.begin == "first_pose")
         self._is_timed = settings.trigger == TIMER
         self._is_odometry = settings.pose_type == ODOMETRY

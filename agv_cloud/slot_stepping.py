@@ -13,15 +13,15 @@ from agv_cloud.staleness.estimate import PoseEstimator
 from agv_cloud.step import EdgeStep
 from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.messages import Slot, StampedPose
-from agv_ros.stamps import Grid, Steps
+from agv_ros.stamps import MAX_LEAP, Grid, Steps
 
 
 class SlotStepping:
     """Turns poses and slots into steps; `blind` counts slots before the first pose, which cannot be answered."""
 
-    def __init__(self, grid: Grid) -> None:
+    def __init__(self, grid: Grid, window: int = MAX_LEAP) -> None:
         self._grid = grid
-        self._steps = Steps(grid)
+        self._steps = Steps(grid, window)
         self._sync: MessageSync[StampedPose] = MessageSync(grid.start_ns)
         self._ready: deque[Joined[StampedPose]] = deque()
         self._answered = -1

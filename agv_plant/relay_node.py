@@ -35,7 +35,7 @@ class RelayNode(LoopNode[RelayParameters]):
         settings = self.settings
         keeps_to_grid = settings.stamps == "grid"
         self.uplink, self.downlink = (
-            Link(Channel(channel, settings.seed, name, settings.ts), self.grid, keeps_to_grid)
+            Link(Channel(channel, settings.seed, name, settings.ts), self.grid, keeps_to_grid, settings.window_steps)
             for name, channel in (("uplink", settings.uplink), ("downlink", settings.downlink))
         )
         self._needs_place = settings.uplink.is_placed or settings.downlink.is_placed

@@ -54,12 +54,19 @@ def stop_on_signals() -> Iterator[Stop]:
 
 
 def spin(executor: Executor, is_done: Callable[[], bool]) -> None:
-    """Run callbacks until `is_done`."""
+    """Run callbacks until `is_done`. Raises UserError; any other error of a callback is counted."""
     while not is_done():
         try:
             executor.spin_once(timeout_sec=SPIN_TIMEOUT)
         except ExternalShutdownException:
             return
+        except UserError:
+            raise
+        except Exception as error:
+            nodes = [node for node in executor.get_nodes() if isinstance(node, LoopNode)]
+            if not nodes:
+                raise
+            nodes[0].survive(error)
 
 
 def spin_for(executor: Executor, is_done: Callable[[], bool], seconds: float) -> bool:

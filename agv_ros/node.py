@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable
 from copy import copy
@@ -28,11 +29,11 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
-from agv_ros.codec import encode_diagnostics, stamp_of
+from agv_ros.codec import encode_diagnostics
 from agv_ros.errors import UserError
-from agv_ros.messages import CHANGED, PUBLISHED, InvalidMessageError
+from agv_ros.messages import CHANGED, PUBLISHED
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
-from agv_ros.stamps import Grid, to_nanoseconds
+from agv_ros.stamps import LATEST_NS, Grid, to_nanoseconds
 
 P = TypeVar("P", bound=LoopParameters)
 
@@ -82,6 +83,9 @@ class LoopNode(Node, Generic[P]):
         self.settings: P = _declare(self, schema)
         self.grid = Grid.of(self.settings.start_time, self.settings.ts)
         self.rejected: Counter[str] = Counter()
+        """Messages by topic that must not enter the loop."""
+        self.survived: Counter[str] = Counter()
+        """Errors of other callbacks by their kind."""
         self.finished = False
         self.failure = ""
         self.outputs: list[Output] = []
@@ -151,8 +155,8 @@ class LoopNode(Node, Generic[P]):
                 callback(data)
             except UserError:  # no other message can repair that
                 raise
-            except ValueError as error:  # InvalidMessageError, OffGridError
-                self.reject(topic, data, error)
+            except Exception as error:  # InvalidMessageError, OffGridError, or what no one has thought of
+                self.reject(topic, error)
 
         def subscribe_when_heard() -> bool:
             if not all(output.is_heard(self.settings.wait_for_subscribers) for output in feeds):
@@ -199,17 +203,27 @@ class LoopNode(Node, Generic[P]):
 
     # -- what went wrong ---------------------------------------------------------------------------------------------
 
-    def reject(self, topic: str, data: bytes, error: ValueError) -> None:
+    def reject(self, topic: str, error: Exception) -> None:
         """Count a message that must not enter the loop; the first of its topic is logged."""
         self.rejected[topic] += 1
         if self.rejected[topic] == 1:
-            self.get_logger().warning(f"{topic}: message rejected: {error}; further ones are only counted")
-        count = self.rejected[topic]
+            self.get_logger().warning(f"{topic}: message rejected: {_said(error)}; further ones are only counted")
+            if not isinstance(error, ValueError):
+                self.get_logger().debug("".join(traceback.format_exception(error)))
+        self._report_now_and_then(self.rejected[topic])
+
+    def survive(self, error: Exception) -> None:
+        """Count an error of a callback that is not a message's, as of a service call; the first of a kind is logged."""
+        self.survived[type(error).__name__] += 1
+        if self.survived[type(error).__name__] == 1:
+            self.get_logger().error(f"{_said(error)}; the node goes on, further ones are only counted")
+            self.get_logger().debug("".join(traceback.format_exception(error)))
+        self._report_now_and_then(self.survived[type(error).__name__])
+
+    def _report_now_and_then(self, count: int) -> None:
+        """Report the first, the second, the fourth ... The stamp of a message that was rejected may be anything."""
         if count & (count - 1) == 0:
-            try:
-                self.report(stamp_of(data))
-            except InvalidMessageError:
-                self.report(self.grid.start_ns)
+            self.report(self._last_ns)
 
     def fail(self, reason: str) -> None:
         """End this node with an error."""
@@ -244,11 +258,13 @@ class LoopNode(Node, Generic[P]):
         facts = self.facts() | {f"{PUBLISHED}{topic}": str(count) for topic, count in published.items()}
         facts |= self._changes
         facts |= {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
+        facts |= {f"errors {kind}": str(count) for kind, count in sorted(self.survived.items())}
         if self._ended:
             facts |= {ENDED: "true"}
         message = f"{total} messages rejected" if total else "ok"
         name = self.get_fully_qualified_name().lstrip("/")
-        self._diagnostics.publish(encode_diagnostics(max(0, stamp_ns), int(total > 0), name, message, facts))
+        stamp_ns = min(max(0, stamp_ns), LATEST_NS)
+        self._diagnostics.publish(encode_diagnostics(stamp_ns, int(total > 0), name, message, facts))
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
@@ -276,6 +292,11 @@ class LoopNode(Node, Generic[P]):
             self._changes[f"{CHANGED}{name}"] = f"{before[name]} -> {value} after step {k}"
         if changed:
             self.report(self._last_ns)
+
+
+def _said(error: Exception) -> str:
+    """An error in a line; of one that is not about a value with its kind."""
+    return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
 
 
 def _declare(node: Node, schema: type[P]) -> P:

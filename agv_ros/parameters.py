@@ -294,6 +294,14 @@ class LoopParameters:
         low=0.0,
         high=60.0,
     )
+    stamp_window: float = parameter(
+        10.0,
+        "a message whose stamp is more than this after the newest one is rejected, unless ten in a row agree that the "
+        "loop has leapt; the same on all nodes",
+        unit="s",
+        low=0.01,
+        high=3600.0,
+    )
     frame_prefix: str = parameter(
         "",
         "what the frames base_link and reference begin with, in messages and on /tf, as robot_state_publisher has it: "
@@ -301,12 +309,20 @@ class LoopParameters:
     )
 
     @property
+    def window_steps(self) -> int:
+        """Whole periods of `stamp_window`, one at least."""
+        return max(1, round(self.stamp_window / self.ts))
+
+    @property
     def steps_ahead(self) -> int:
         """Whole periods that edge/error looks ahead."""
         return round(self.look_ahead / self.ts)
 
 
-SHARED = ("ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_steps", "look_ahead", "frame_prefix")
+SHARED = (
+    "ts", "start_time", "wait_for_subscribers", "stop_timeout", "plan_steps", "look_ahead", "stamp_window",
+    "frame_prefix",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 NS_PER_S = 1_000_000_000
 
+LATEST_NS = 2**31 * NS_PER_S - 1
+"""The latest instant [ns] that a stamp of ROS can hold."""
+
 
 class OffGridError(ValueError):
     """A stamp that is no sampling instant t_k with k >= 0."""
@@ -56,24 +59,41 @@ MAX_FIRST = 100_000_000
 """Latest step at which a node may join a running loop: 5.8 days at 5 ms."""
 
 
-class Steps:
-    """Steps of a running loop: as `Grid.step`, but a single wrong stamp cannot send a node far into the future."""
+AGREEING = 10
+"""So many messages in a row, each within the window of the one before, show that the loop itself has leapt."""
 
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
+
+class Steps:
+    """Steps of a running loop: as `Grid.step`, but a wrong stamp cannot send a node far into the future.
+
+    A stamp more than `window` steps after the newest one is refused, unless those before it, one after the other, agree
+    with it: then the messages are right, and the loop has paused or leapt.
+    """
+
+    def __init__(self, grid: Grid, window: int = MAX_LEAP) -> None:
+        self._grid, self._window = grid, window
         self._last: int | None = None
+        self._beyond = 0
+        """Step of the last stamp that was refused, and how many in a row agree with each other."""
+        self._agreeing = 0
 
     def of(self, stamp_ns: int) -> int:
-        """Step of a stamp. Raises OffGridError for no sampling instant, or one MAX_LEAP steps past the last."""
+        """Step of a stamp. Raises OffGridError for no sampling instant, or one too far after the newest one."""
         k = self._grid.step(stamp_ns)
-        latest = MAX_FIRST if self._last is None else self._last + MAX_LEAP
-        if k > latest:
+        latest = MAX_FIRST if self._last is None else self._last + self._window
+        if k > latest and not self._agrees(k):
             raise OffGridError(
                 f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, the last one seen was {self._last}; "
                 f"steps up to {latest} are accepted: do all nodes have the same start_time?"
             )
-        self._last = k
+        self._last, self._agreeing = k, 0
         return k
+
+    def _agrees(self, k: int) -> bool:
+        """Has the loop leapt to step k, as enough messages in a row say?"""
+        follows = self._agreeing > 0 and 0 < k - self._beyond <= self._window
+        self._agreeing, self._beyond = self._agreeing + 1 if follows else 1, k
+        return self._last is not None and self._agreeing >= AGREEING and k <= self._last + MAX_FIRST
 
 
 class NearestSteps:

@@ -289,6 +289,48 @@ def test_stamps_off_the_grid_are_rejected(bench: Bench) -> None:
     assert relay.rejected == {"agv/pose": 1}
 
 
+def wild(message: Any, sec: int, nanosec: int) -> Any:
+    message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+    return message
+
+
+def test_wild_stamps_are_rejected_and_the_loop_goes_on(bench: Bench) -> None:
+    """No stamp that a message can carry ends a node, or makes it take those that follow for outdated."""
+    relay, edge = bench.add(RelayNode), bench.add(ErrorDetectorNode, track="line", track_start=[0.0, 0.0, 0.0])
+    controller = bench.add(ControllerNode)
+    commands = bench.received(TwistStamped, "agv/cmd_vel")
+    kinds = {
+        "agv/pose": PoseStamped, "edge/pose": PoseStamped, "edge/slot": TimeReference, "edge/error": Odometry,
+        "edge/cmd_vel": TwistStamped,
+    }  # fmt: skip
+    publishers = {topic: bench.publisher(kind, topic) for topic, kind in kinds.items()}
+    poses = publishers["agv/pose"]
+    for k in range(3):
+        poses.publish(pose(k))
+    bench.until_count(commands, 3)
+    stamps = ((2**31 - 1, 2**32 - 1), (-(2**31), 0), (0, 0), (11, 25_000_000))  # the last is 2005 steps ahead
+    for topic, kind in kinds.items():
+        for sec, nanosec in stamps:
+            publishers[topic].publish(wild(kind(), sec, nanosec))
+    bench.until(lambda: relay.rejected["agv/pose"] == edge.rejected["edge/slot"] == len(stamps))
+    # The controller, which has no clock, answers what it can; what it answers is rejected in its turn.
+    bench.until(lambda: controller.rejected["edge/error"] > 0 and relay.rejected["edge/cmd_vel"] > len(stamps))
+    for k in range(3, 6):
+        poses.publish(pose(k))
+    bench.until_count(commands, 6)
+
+
+def test_a_parameter_of_no_known_type_does_not_end_a_node(bench: Bench) -> None:
+    controller = bench.add(ControllerNode)
+    client = bench.probe.create_client(SetParameters, "/controller/set_parameters")
+    bench.until(client.service_is_ready)
+    request = SetParameters.Request(parameters=[Parameter("kx", value=7.5).to_parameter_msg()])
+    request.parameters[0].value.type = 99
+    client.call_async(request)
+    bench.until(lambda: sum(controller.survived.values()) == 1)
+    assert set_parameter(bench, "controller", "kx", 7.5).successful
+
+
 # -- an edge with a clock of its own ----------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.radio.channel import Channel, SlotOutcome
 from agv_plant.radio.delay import EXPIRED, whole_slots
 from agv_ros.messages import DELAYED, DELIVERED, LOST, Slot
-from agv_ros.stamps import Grid, NearestSteps, Steps
+from agv_ros.stamps import MAX_LEAP, Grid, NearestSteps, Steps
 
 
 class Passage(NamedTuple):
@@ -31,9 +31,9 @@ class Link:
     started again meanwhile and has forgotten it.
     """
 
-    def __init__(self, channel: Channel, grid: Grid, keeps_to_grid: bool = True) -> None:
+    def __init__(self, channel: Channel, grid: Grid, keeps_to_grid: bool = True, window: int = MAX_LEAP) -> None:
         self.channel = channel
-        self._steps = Steps(grid) if keeps_to_grid else NearestSteps(grid.ts_ns)
+        self._steps = Steps(grid, window) if keeps_to_grid else NearestSteps(grid.ts_ns)
         self._freshest_ns = 0
         self._freshest: list[bytes] = []
         self._sent_ns = -1

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_ros.stamps import MAX_FIRST, MAX_LEAP, Grid, NearestSteps, OffGridError, Steps, to_nanoseconds
+from agv_ros.stamps import AGREEING, MAX_FIRST, MAX_LEAP, Grid, NearestSteps, OffGridError, Steps, to_nanoseconds
 
 grids = st.builds(Grid, st.integers(1, 2 * 10**18), st.integers(1000, 10**10))
 
@@ -66,6 +66,21 @@ def test_a_wild_stamp_is_refused_and_changes_nothing() -> None:
         steps.of(grid.stamp(4) + 1)
     assert steps.of(grid.stamp(3 + MAX_LEAP)) == 3 + MAX_LEAP
     assert steps.of(grid.stamp(4)) == 4
+
+
+def test_a_loop_that_has_leapt_is_followed_once_enough_messages_agree() -> None:
+    grid = Grid(10**9, 5_000_000)
+    steps = Steps(grid, window=2000)
+    assert steps.of(grid.stamp(5)) == 5
+    for i in range(AGREEING - 1):  # none of these belongs to a run that goes on there
+        with pytest.raises(OffGridError):
+            steps.of(grid.stamp(10_000 * (i + 1)))
+    assert steps.of(grid.stamp(6)) == 6
+    for k in range(50_000, 50_000 + AGREEING - 1):
+        with pytest.raises(OffGridError):
+            steps.of(grid.stamp(k))
+    assert steps.of(grid.stamp(50_000 + AGREEING)) == 50_000 + AGREEING
+    assert steps.of(grid.stamp(50_000 + AGREEING + 2000)) == 50_000 + AGREEING + 2000
 
 
 def test_a_node_may_join_a_loop_that_has_run_for_days_but_not_one_of_another_clock() -> None:
