@@ -3,6 +3,7 @@
 The peers read the same file and the same topics: mcap-ros2-support's decoded iteration, rosbags' raw iteration with its
 CDR decoder, the mcap library's bare iteration, and, for what no reader can do without, its decompression alone. Reading
 here includes the checksums, which none of the peers compares. The peers that are slow read the first messages only.
+An export is measured as its user has it, as a whole process from the start of Python on.
 
 The bag is made here: one chunk of a real recording of the loop, again and again, its stamps moved on.
 """
@@ -12,10 +13,12 @@ from __future__ import annotations
 import functools
 import itertools
 import struct
+import subprocess
+import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -35,6 +38,7 @@ from benchmarks.comparison import Comparison
 
 SAMPLE = Path(__file__).parent.parent / "bags" / "sample"
 MESSAGES = 10_000_000
+POSES = 300_000
 OF_SLOW_PEERS = 100_000
 OF_CHECK = 20_000
 LOOP = ["/agv/pose", "/edge/pose", "/edge/slot", "/edge/error", "/edge/cmd_vel", "/agv/cmd_vel", "/agv/slot", "/clock"]
@@ -58,6 +62,7 @@ def measure() -> list[Comparison]:
         support = _rate_of(iterate_support(path, LOOP))
         rosbags = _rate_of(iterate_rosbags(path, LOOP))
         bare = _rate_of(iterate_mcap(path, LOOP))
+        export, loop = _processes(Path(folder))
     all_topics, inflating = f"{total / 1e6:.1f} million messages, all topics", "decompression alone"
     return [
         Comparison(all_topics, total / whole.wall, "mcap-ros2-support, decoded", support, UNIT, 100.0),
@@ -69,6 +74,10 @@ def measure() -> list[Comparison]:
             "MB/s", 1 / 3,
         ),
         Comparison("all topics", megabytes / whole.wall, f"{inflating}, kept", megabytes / kept.wall, "MB/s"),
+        Comparison(
+            "export of 300 000 poses to NPZ, whole process", POSES / export, "mcap-ros2-support, plain loop",
+            POSES / loop, UNIT, 8.0,
+        ),
         Comparison("all topics, time of all cores", megabytes / whole.cpu, inflating, megabytes / alone.cpu, "MB/s"),
     ]  # fmt: skip
 
@@ -92,6 +101,32 @@ def _best(work: Callable[[], object], times: int = 8) -> Seconds:
         work()
         found.append(Seconds(time.perf_counter() - begun, time.process_time() - begun_cpu))
     return Seconds(min(wall for wall, _ in found), min(cpu for _, cpu in found))
+
+
+PLAIN_LOOP = """
+import sys
+from mcap.reader import NonSeekingReader
+from mcap_ros2.decoder import DecoderFactory
+with open(sys.argv[1], "rb") as file:
+    for _ in NonSeekingReader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages(log_time_order=False):
+        pass
+"""
+
+
+def _processes(folder: Path) -> tuple[float, float]:
+    """Seconds that an export of poses takes, and a loop over the decoded messages, each as a whole process."""
+    path, out = folder / "poses.mcap", folder / "poses.npz"
+    make_bag(path, POSES, ["/agv/pose"])
+
+    def export() -> None:
+        out.unlink(missing_ok=True)
+        command = [sys.executable, "-m", "agv_analysis.cli", "bag", "export", str(path), "--npz", "--out", str(out)]
+        subprocess.run(command, check=True, capture_output=True)
+
+    def loop() -> None:
+        subprocess.run([sys.executable, "-c", PLAIN_LOOP, path], check=True)
+
+    return _best(export, times=4).wall, _best(loop, times=1).wall
 
 
 def _rate_of(messages: Iterable[object]) -> float:
@@ -179,9 +214,9 @@ class Template(NamedTuple):
     """Schemas and channels."""
 
 
-def make_bag(path: Path, messages: int) -> int:
-    """Write an MCAP file as the recorder does, of at least `count` messages; returns their number."""
-    template = _template()
+def make_bag(path: Path, messages: int, topics: Sequence[str] = LOOP) -> int:
+    """Write an MCAP file as the recorder does, of at least `messages` messages; returns their number."""
+    template = _template(topics)
     per_chunk = sum(map(len, template.entries.values()))
     chunks = -(-messages // per_chunk)
     with path.open("wb") as file:
@@ -208,13 +243,13 @@ def _bytes(*records: McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def _template() -> Template:
+def _template(topics: Sequence[str]) -> Template:
     """The first steps of the sample's loop, without its diagnostics, as one chunk."""
     content, times, seconds = RecordBuilder(), [], []
     definitions: dict[str, McapRecord] = {}
     index: dict[int, list[tuple[int, int]]] = {}
     with next(SAMPLE.glob("*.mcap")).open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages(topics=LOOP):
+        for schema, channel, message in make_reader(file).iter_messages(topics=topics):
             if message.log_time >= 1_000_000_000 + SECONDS_PER_CHUNK * 1_000_000_000 or schema is None:
                 break
             definitions[f"1 {schema.id}"], definitions[f"2 {channel.id}"] = schema, channel

@@ -24,7 +24,7 @@ from agv_analysis.bags.message_table import Table
 from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import Contents, locate, open_files
 from agv_analysis.bags.schema import Struct, parse_schema, short_name
-from agv_analysis.bags.storage import LARGE, Storage
+from agv_analysis.bags.storage import Storage, is_large
 from agv_analysis.bags.type_hash import contradicts
 
 _THREADS = 2
@@ -237,7 +237,7 @@ class _Reading:
                 if contradicts(schema.name, definition.schema.text, channel.metadata.get(TYPE_HASH, "")):
                     what = "definition of its type that does not match the recorded hash, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
-                helper = self._helper if storage.size > LARGE else None
+                helper = self._helper if is_large(storage.size) else None
                 self._tables[topic] = Table(form, storage.expected(channel.id), helper)
         except UndecodableError as error:
             self._refuse(topic, error)

@@ -80,7 +80,7 @@ from agv_analysis.bags.records import (
     parse_statistics,
 )
 from agv_analysis.bags.source import Record, Source
-from agv_analysis.bags.storage import LARGE, IsWanted, undescribed
+from agv_analysis.bags.storage import IsWanted, is_large, undescribed
 
 _DISTRO = re.compile(r"^ros_distro:\s*['\"]?(\w+)", re.MULTILINE)
 
@@ -215,7 +215,7 @@ class McapFile:
 
     def batches(self, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         """The messages of all channels that are wanted, in file order, in batches of one channel. To be called once."""
-        for item, opened in _ahead(self._items(), is_large=self.size > LARGE):
+        for item, opened in _ahead(self._items(), is_large=is_large(self.size)):
             self.position = item.position
             if isinstance(item, _Run):
                 if not self._is_proven:

@@ -15,18 +15,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
-import yaml
-
 from agv_analysis.bags.bag_errors import BagError
 from agv_analysis.bags.compression import compression_of
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.mcap_file import McapFile
 from agv_analysis.bags.records import MAGIC as MCAP
-from agv_analysis.bags.sqlite_file import MAGIC as SQLITE
-from agv_analysis.bags.sqlite_file import SqliteFile
 from agv_analysis.bags.storage import Storage
 
 METADATA = "metadata.yaml"
+
+SQLITE = b"SQLite format 3\0"
+"""First bytes of a sqlite3 database."""
 
 _PACKED = (".zstd", ".zst")
 """Endings of files that were compressed as a whole; the first is rosbag2's."""
@@ -189,6 +188,8 @@ def _open(path: Path, keep_all: bool) -> Storage:
     if begin.startswith(b"#ROSBAG V"):
         raise BagError(f"{path}: is a ROS 1 bag; {_convert(path)}")
     if begin.startswith(SQLITE) or (path.suffix.lower() == ".db3" and begin):
+        from agv_analysis.bags.sqlite_file import SqliteFile
+
         return SqliteFile(path, keep_all)
     return McapFile(path, keep_all)
 
@@ -333,12 +334,14 @@ def _present(path: Path, listed: list[Path], findings: Findings) -> list[Path]:
 
 def _read_metadata(path: Path) -> dict[str, Any]:
     """Content of a metadata.yaml. Raises ValueError, TypeError or KeyError if it is none."""
+    import yaml
+
     try:
         with path.open("rb") as file:
             text = file.read(min(path.stat().st_size, _MAX_METADATA) + 1)
         if len(text) > _MAX_METADATA:
             raise ValueError(f"it has more than {_MAX_METADATA} bytes")
-        about = yaml.safe_load(text)["rosbag2_bagfile_information"]
+        about = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))["rosbag2_bagfile_information"]
     except OSError as error:
         raise BagError(f"{path}: cannot be read: {error.strerror}") from None
     except (yaml.YAMLError, RecursionError) as error:

@@ -76,11 +76,19 @@ def parse_schema(name: str, encoding: str, text: str) -> Struct:
 
     Raises UndecodableError if the text is not understood, lacks a type, or describes a type without end.
     """
+    texts = definitions_by_name(name, encoding, text)
+    return Struct(tuple(_Unfolding(texts).members(short_name(name), "", 0)))
+
+
+def definitions_by_name(name: str, encoding: str, text: str) -> dict[str, str]:
+    """Definitions, in the message language, of the type `name` and of all types in it, by their short names.
+
+    Raises UndecodableError if the text is not understood.
+    """
     if encoding not in ("ros2msg", "ros2idl"):
         raise UndecodableError(f"its definition is in {encoding or 'no language'!r}; ros2msg and ros2idl are read")
     named = _by_name(short_name(name), text) if encoding == "ros2msg" else _by_name_in_idl(name, text)
-    texts = {**_BUILT_IN, **named}
-    return Struct(tuple(_Unfolding(texts).members(short_name(name), "", 0)))
+    return {**_BUILT_IN, **named}
 
 
 def short_name(name: str) -> str:
@@ -120,7 +128,7 @@ class _Unfolding:
             raise UndecodableError(f"its definition is nested more than {_MAX_DEPTH} deep")
         empty = True
         for line in self._texts[name].splitlines():
-            member = _parse_line(line)
+            member = parse_line(line)
             if member is None:
                 continue
             empty = False
@@ -137,23 +145,24 @@ class _Unfolding:
         if kind == STRING or kind in PRIMITIVES:
             yield Member(path, PRIMITIVES.get(kind, STRING), member.length, member.is_sequence)
         elif is_array:
-            struct = Struct(tuple(self.members(self._resolve(kind, parent), "", depth + 1)))
+            struct = Struct(tuple(self.members(resolve_type(self._texts, kind, parent), "", depth + 1)))
             yield Member(path, struct, member.length, member.is_sequence)
         else:
-            yield from self.members(self._resolve(kind, parent), f"{path}.", depth + 1)
-
-    def _resolve(self, kind: str, parent: str) -> str:
-        """Full name of a type as a member of `parent` names it."""
-        short = short_name(kind)
-        package = parent.rpartition("/")[0]
-        candidates = [short] if "/" in short else [f"{package}/{short}", f"std_msgs/{short}"]
-        for candidate in candidates:
-            if candidate in self._texts:
-                return candidate
-        raise UndecodableError(f"its definition uses the type {kind!r} without describing it")
+            yield from self.members(resolve_type(self._texts, kind, parent), f"{path}.", depth + 1)
 
 
-def _parse_line(line: str) -> Member | None:
+def resolve_type(texts: dict[str, str], kind: str, parent: str) -> str:
+    """Full name, among the definitions `texts`, of a type as a member of `parent` names it. Raises UndecodableError."""
+    short = short_name(kind)
+    package = parent.rpartition("/")[0]
+    candidates = [short] if "/" in short else [f"{package}/{short}", f"std_msgs/{short}"]
+    for candidate in candidates:
+        if candidate in texts:
+            return candidate
+    raise UndecodableError(f"its definition uses the type {kind!r} without describing it")
+
+
+def parse_line(line: str) -> Member | None:
     """The member that a line declares, its type by name; None for a constant or a comment."""
     line = line.strip()
     if not line or line.startswith("#"):

@@ -27,8 +27,6 @@ from agv_analysis.bags.message_batch import Batch
 from agv_analysis.bags.records import QOS, TYPE_HASH, Attachment, Channel, Schema
 from agv_analysis.bags.storage import IsWanted, undescribed
 
-MAGIC = b"SQLite format 3\0"
-
 _ROWS = 16384
 _BYTES = 2**24
 """Messages, and bytes of them, that are passed on together."""

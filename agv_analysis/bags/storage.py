@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,8 +12,16 @@ from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.message_batch import Batch
 from agv_analysis.bags.records import Attachment, Channel, Schema
 
-LARGE = 2**24
-"""Files of more bytes than this are read by compiled code, which takes a moment to be loaded."""
+LARGE = 2**28
+LARGE_ONCE_LOADED = 2**24
+"""Files of more bytes than this are read by compiled code: to load the compiler takes as long as to read the first
+number of bytes without it."""
+
+
+def is_large(size: int) -> bool:
+    """Does compiled code pay for a file of so many bytes?"""
+    return size > (LARGE_ONCE_LOADED if "numba" in sys.modules else LARGE)
+
 
 IsWanted = Callable[[Channel], bool]
 

@@ -64,6 +64,7 @@ def info(bag: Path, definitions: Path | None, json_file: Path | None) -> None:
 @click.option("--csv", "form", flag_value="csv", help="One CSV file for each topic, in the directory OUT.")
 @click.option("--parquet", "form", flag_value="parquet", help="One Parquet file for each topic, in the directory OUT.")
 @click.option("--npz", "form", flag_value="npz", help="One file OUT of numpy arrays.")
+@click.option("--tum", "form", flag_value="tum", help="One TUM trajectory for each topic with poses, as for evo.")
 @click.option("--topic", "topics", multiple=True, help="Only this topic. May be repeated.")
 @_DEFINITIONS
 @click.option("--out", "-o", type=click.Path(path_type=Path), help="Where to; by default beside BAG.")
@@ -74,6 +75,7 @@ def export(bag: Path, form: str | None, topics: tuple[str, ...], definitions: Pa
     Examples:
       agv-ncs bag export bags/first --csv --topic /agv/pose
       agv-ncs bag export bags/first --npz --out first.npz
+      agv-ncs bag export bags/first --tum --topic /agv/pose --out trajectories
     """
     from agv_analysis.bags.export import EXPORTS
 

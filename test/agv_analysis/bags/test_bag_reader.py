@@ -18,8 +18,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from agv_analysis.bags import BagError, mcap_file, read_bag
-from agv_analysis.bags import bag as bag_module
+from agv_analysis.bags import BagError, read_bag, storage
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 REPOSITORY = Path(__file__).parents[3]
@@ -134,8 +133,8 @@ def test_every_kind_of_mcap_file(tmp_path: Path, variant: str) -> None:
 @pytest.fixture
 def as_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files of any size are read as large ones are: by compiled code."""
-    for module in (bag_module, mcap_file):
-        monkeypatch.setattr(module, "LARGE", 0)
+    for limit in ("LARGE", "LARGE_ONCE_LOADED"):
+        monkeypatch.setattr(storage, limit, 0)
 
 
 @pytest.mark.usefixtures("as_large")
@@ -175,8 +174,8 @@ def test_times_that_cannot_be_are_found_in_large_files_too(
             writer.add_message(channel, 1000 + i + new["log"], payload(sent), 990 + new["of"] + new["publish"])
         writer.finish()  # type: ignore[no-untyped-call]
     small = read_bag(tmp_path / "bag.mcap")
-    for module in (bag_module, mcap_file):
-        monkeypatch.setattr(module, "LARGE", 0)
+    for limit in ("LARGE", "LARGE_ONCE_LOADED"):
+        monkeypatch.setattr(storage, limit, 0)
     assert read_bag(tmp_path / "bag.mcap").problems == small.problems
     assert said in " ".join(small.problems)
     assert bool(said) == bool(small.problems)

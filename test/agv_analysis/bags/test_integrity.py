@@ -25,8 +25,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from agv_analysis.bags import Bag, BagError, mcap_file, message_compression, read_bag, rosbag2
-from agv_analysis.bags import bag as bag_module
+from agv_analysis.bags import Bag, BagError, message_compression, read_bag, rosbag2, storage
 from agv_analysis.bags.chunk import sort_out, walk
 from agv_analysis.bags.recover import recover
 
@@ -131,8 +130,8 @@ def places_of(kind: str) -> int:
 def kind(request: pytest.FixtureRequest) -> Iterator[str]:
     with pytest.MonkeyPatch.context() as patch:
         if "compiled" in request.param:
-            for module in (bag_module, mcap_file):
-                patch.setattr(module, "LARGE", 0)
+            for limit in ("LARGE", "LARGE_ONCE_LOADED"):
+                patch.setattr(storage, limit, 0)
         yield str(request.param)
 
 
@@ -392,7 +391,8 @@ def test_hostile_lengths_inside_records(read: Callable[[bytes], Bag]) -> None:
 def test_a_message_index_is_not_believed(
     read: Callable[[bytes], Bag], monkeypatch: pytest.MonkeyPatch, large: int
 ) -> None:
-    monkeypatch.setattr(mcap_file, "LARGE", large)
+    for limit in ("LARGE", "LARGE_ONCE_LOADED"):
+        monkeypatch.setattr(storage, limit, large)
     content = message(1) + message(2) + message(3)
     size, useless = len(message(1)), "message index that does not fit its chunk, not used"
     for places in ([0, size, 2 * size], [2 * size, size, 0], [0, 2 * size], [0, size, 2 * size, 0], [0, size, 7],

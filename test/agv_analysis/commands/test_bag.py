@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 
 from agv_analysis.bags import read_bag
@@ -121,8 +122,47 @@ def test_parquet_is_exact(tmp_path: Path) -> None:
     assert table["time_ref.nanosec"].to_pylist() == rows["time_ref.nanosec"].tolist()
 
 
+def test_parquet_says_what_its_columns_mean(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    agv_ncs("bag", "export", SAMPLE, "--parquet", "--topic", "/edge/error", "--out", tmp_path / "out")
+    schema = parquet.read_schema(tmp_path / "out" / "edge.error.parquet")
+    about = {name: schema.field(name).metadata for name in schema.names}
+    assert about["log_time_ns"][b"unit"] == b"ns"
+    assert about["header.stamp.sec"][b"unit"] == b"s"
+    assert about["pose.pose.position.x"][b"unit"] == b"m"
+    assert about["pose.pose.orientation.w"][b"unit"] == b"1"
+    assert about["twist.twist.linear.x"][b"unit"] == b"m/s"
+    assert about["twist.twist.angular.z"][b"unit"] == b"rad/s"
+    assert b"6x6 covariance matrix" in about["pose.covariance[35]"][b"meaning"]
+    assert schema.metadata[b"topic"] == b"/edge/error"
+    assert schema.metadata[b"type"] == b"nav_msgs/msg/Odometry"
+
+
+def test_tum_trajectories_are_exact(tmp_path: Path) -> None:
+    result = agv_ncs("bag", "export", SAMPLE, "--tum", "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"agv.pose.tum", "edge.pose.tum", "edge.error.tum"}
+    lines = (tmp_path / "out" / "agv.pose.tum").read_text().splitlines()
+    with (next(SAMPLE.glob("*.mcap"))).open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        poses = [message for _, _, _, message in reader.iter_decoded_messages(topics=["/agv/pose"])]
+    assert len(lines) == len(poses)
+    for line, message in zip(lines, poses, strict=True):
+        p, q, stamp = message.pose.position, message.pose.orientation, message.header.stamp
+        time, *values = line.split()
+        assert time == f"{stamp.sec}.{stamp.nanosec:09d}"
+        assert [float(value) for value in values] == [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+
+
+def test_a_bag_without_poses_has_no_trajectory(tmp_path: Path) -> None:
+    result = agv_ncs("bag", "export", SAMPLE, "--tum", "--topic", "/clock", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "no topic with poses: /clock" in result.stderr
+
+
 def test_export_refuses_what_it_cannot_do(tmp_path: Path) -> None:
-    assert "choose a format: --csv, --parquet, --npz" in agv_ncs("bag", "export", SAMPLE).stderr
+    assert "choose a format: --csv, --parquet, --npz, --tum" in agv_ncs("bag", "export", SAMPLE).stderr
     missing = agv_ncs("bag", "export", SAMPLE, "--csv", "--topic", "/nowhere", "--out", tmp_path / "out")
     assert missing.exit_code == 1
     assert "no topic /nowhere; it has /agv/cmd_vel" in missing.stderr

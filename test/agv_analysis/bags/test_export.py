@@ -1,0 +1,87 @@
+"""Columns with units and meaning, and trajectories of transforms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from agv_analysis.bags import read_bag
+from agv_analysis.bags.column_notes import Note, column_notes
+from agv_analysis.bags.trajectories import trajectories_of
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TF = "tf2_msgs/msg/TFMessage"
+
+
+@pytest.mark.parametrize(
+    ("path", "unit", "meaning"),
+    [
+        ("height", "mm", "how far above the ground [mm]"),
+        ("speed", "", "in [m/s] or [km/h], as configured"),
+        ("plain", "", ""),
+        ("linear.x", "m/s", ""),
+        ("len(many)", "1", "number of elements of many"),
+        ("many.y", "m", "second coordinate"),
+        ("angle", "rad", "start angle [rad] which way (left)"),
+    ],
+)
+def test_units_and_meaning_from_the_definition(path: str, unit: str, meaning: str) -> None:
+    text = """# What the file is about, which is of no field.
+
+# how far above the ground [mm]
+float64 height
+int8 CONSTANT=3
+float64 speed     # in [m/s] or [km/h], as configured
+float64 plain
+
+# start angle [rad]
+float64 angle  # which way (left)
+Vector linear
+geometry_msgs/Point[] many
+================================================================================
+MSG: my_msgs/Vector
+float64 x # of a speed [m/s]
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y  # second coordinate
+"""
+    note = column_notes("my_msgs/msg/Thing", text)[path]
+    if path == "linear.x":
+        meaning = "of a speed [m/s]"
+    assert note == Note(unit, meaning)
+
+
+def test_a_definition_that_is_not_understood_has_no_notes() -> None:
+    assert set(column_notes("a/A", "what is this")) == {"log_time_ns", "publish_time_ns"}
+
+
+def test_transforms_are_trajectories_by_frame(tmp_path: Path) -> None:
+    types: dict[str, Any] = STORE.types
+    vector, turn = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    transform, stamped = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/TransformStamped"]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        text = STORE.generate_msgdef(TF, ros_version=2)[0].encode()
+        channel = writer.register_channel("/tf", "cdr", writer.register_schema(TF, "ros2msg", text))
+        for k in range(6):
+            found = []
+            for frame in ("base", "arm")[: 1 + k % 2]:
+                stamp = types["builtin_interfaces/msg/Time"](7, k)
+                header = types["std_msgs/msg/Header"](stamp, "map")
+                place = vector(float(k), np.nan if (k, frame) == (3, "arm") else 2.0, 3.0)
+                found.append(stamped(header, frame, transform(place, turn(0.0, 0.0, 0.0, 1.0))))
+            payload = bytes(STORE.serialize_cdr(types[TF](found), TF))
+            writer.add_message(channel, 100 + k, payload, 100 + k)
+        writer.finish()  # type: ignore[no-untyped-call]
+    arm, base = trajectories_of(read_bag(tmp_path / "a.mcap")["/tf"])
+    assert (arm.name, base.name) == ("arm", "base")
+    assert list(arm.lines()) == ["7.000000001 1.0 2.0 3.0 0.0 0.0 0.0 1.0", "7.000000005 5.0 2.0 3.0 0.0 0.0 0.0 1.0"]
+    assert base.times.tolist() == [7 * 10**9 + k for k in range(6)]
+    assert base.poses[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
