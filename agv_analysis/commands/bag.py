@@ -122,6 +122,45 @@ def recover(bag: Path, out: Path, definitions: Path | None) -> None:
     _warn(recovery.problems, recovery.is_complete)
 
 
+@command.command("outages")
+@click.argument("bag", type=click.Path(path_type=Path))
+@click.option("--topic", required=True, help="Whose messages: of any type with a header, or of any other.")
+@click.option("--period", type=click.FloatRange(min=0.0, min_open=True), help="Time between messages sent [s].")
+@_DEFINITIONS
+@click.option("--trace", type=click.Path(path_type=Path), help="Write a file for the channel trace, with times.")
+@click.option("--picture", type=click.Path(path_type=Path), help="Draw the outages to this file.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+def outages(
+    bag: Path, topic: str, period: float | None, definitions: Path | None, trace: Path | None, picture: Path | None,
+    json_file: Path | None,
+) -> None:  # fmt: skip
+    """Show which messages of a periodic topic of BAG are missing: losses, outages, ages, delays, a fitted channel.
+
+    The stamps in the messages' headers say which are missing; where there are none, or the type cannot be decoded, the
+    log times do. Without --period it is what most messages are apart.
+
+    \b
+    Examples:
+      agv-ncs bag outages someone_elses.mcap --topic /odom
+      agv-ncs bag outages drive.db3 --topic /scan --period 0.1 --trace scan.csv
+    """
+    from rich.console import Console
+
+    from agv_analysis.bags import BagError, read_bag
+    from agv_analysis.commands.link import show_measurement
+    from agv_analysis.link.formats.bag_topic import measure_topic
+
+    with _bar(bag, "reading") as progress:
+        content = read_bag(bag, [topic], progress, definitions)
+    if topic not in content.topics:
+        raise BagError(f"{bag}: no topic {topic}; it has {', '.join(content.topics) or 'none'}")
+    measured = measure_topic(content, topic, period)
+    found = show_measurement(Console(highlight=False), measured, None, "half", trace, picture)
+    if json_file is not None:
+        write_json(json_file, found)
+    _warn(content.problems, content.is_complete)
+
+
 def _warn(problems: tuple[str, ...], is_complete: bool) -> None:
     for problem in problems:
         click.echo(problem, err=True)

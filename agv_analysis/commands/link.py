@@ -69,7 +69,7 @@ def command(
     elif isinstance(reading, LossRates):
         found = _rates(console, reading)
     else:
-        found = _measured(console, reading, scenario, rtt, trace, picture)
+        found = show_measurement(console, reading, scenario, rtt, trace, picture)
     if json_file is not None:
         write_json(json_file, found)
     if isinstance(reading, LossRates) and (scenario is not None or trace is not None):
@@ -132,10 +132,11 @@ def _rates(console: Console, found: LossRates) -> dict[str, Any]:
     return rates_to_json(found)
 
 
-def _measured(
+def show_measurement(
     console: Console, measured: Measurement, scenario: Scenario | None, rtt: str, trace: Path | None,
     picture: Path | None,
 ) -> dict[str, Any]:  # fmt: skip
+    """Print what a measured link comes to, and what a loop does behind it; returns the figures as JSON."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -221,7 +222,7 @@ def rows(found: LinkFigures) -> Iterator[tuple[str, ...]]:
     yield "Loss rate (95 %)", *map(_rate, directions)
     yield "Outages", *(str(len(direction.outages)) if direction.is_told else "-" for direction in directions)
     yield "Longest outage", *(_ms(direction.longest) if direction.is_told else "-" for direction in directions)
-    for title, part in (("Delay", "delay"), ("Jitter", "jitter")):
+    for title, part in (("Age", "age"), ("Delay", "delay"), ("Jitter", "jitter")):
         spreads = [getattr(direction, part) for direction in directions]
         if any(spread is not None for spread in spreads):
             yield f"{title} p50, p95, p99, max", *map(_spread, spreads)

@@ -14,7 +14,7 @@ from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
 from agv_analysis.link.measurement import LossRates, Measurement, PacketOutcomes, Setting
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.resampling import weights
-from agv_analysis.metrics.outages import outage_begins, outage_lengths
+from agv_analysis.metrics.outages import ages, outage_begins, outage_lengths
 from agv_analysis.run import Floats
 from agv_ros.parameters import as_dict
 
@@ -99,6 +99,13 @@ class DirectionFigures:
         return float(np.median(np.diff(self._sent))) if len(self._sent) > 1 else 0.0
 
     @cached_property
+    def age(self) -> Spread | None:
+        """How old the freshest packet is that has come, by the losses alone [s]; None where the file cannot tell."""
+        if not self.is_told or not len(self.k):
+            return None
+        return Spread.of(np.asarray(ages(self.k, self.lost) * self._interval, np.float64))
+
+    @cached_property
     def delay(self) -> Spread | None:
         """Time under way [s] of what was received; None if it is not known."""
         return None if self._packets.delay is None else Spread.of(self._packets.delay)
@@ -118,6 +125,7 @@ class DirectionFigures:
             "outages": len(self.outages),
             "outage_max_s": self.longest if self.is_told else None,
             "outage_mean_s": float(self.outages.mean()) if self.is_told and len(self.outages) else None,
+            "age": None if self.age is None else self.age.to_json(),
             "delay": None if self.delay is None else self.delay.to_json(),
             "jitter": None if self.jitter is None else self.jitter.to_json(),
         }
@@ -189,7 +197,7 @@ _KEYS = ("mean_s", *(f"p{q}_s" for q in PERCENTILES), "max_s")
 def _untold() -> dict[str, Any]:
     """Of a direction that the file does not tell."""
     return dict.fromkeys(
-        ("packets", "lost", "loss_rate", "outages", "outage_max_s", "outage_mean_s", "delay", "jitter")
+        ("packets", "lost", "loss_rate", "outages", "outage_max_s", "outage_mean_s", "age", "delay", "jitter")
     )
 
 

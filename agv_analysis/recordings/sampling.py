@@ -35,7 +35,7 @@ def sampling_of(stamps: Steps, where: str) -> Sampling:
     if len(stamps) < 3:
         raise UserError(f"{where}: {len(stamps)} poses with a stamp of their own; at least 3 are needed for a period")
     gaps = np.diff(stamps)
-    period = _period(gaps)
+    period = period_of(gaps)
     steps = np.maximum(1, np.rint(gaps / period)).astype(np.int64)
     if steps.max() > MAX_LEAP or steps.sum() > MAX_LEAP + 100 * len(stamps):
         i = int(np.argmax(steps))
@@ -49,7 +49,7 @@ def sampling_of(stamps: Steps, where: str) -> Sampling:
     return Sampling(mean, k, gaps - steps * mean)
 
 
-def _period(gaps: Steps) -> float:
+def period_of(gaps: Steps) -> float:
     """Median of the gaps [ns] that are one period long; of all gaps it would be too long if some poses are lost.
 
     Quantiles are values that occurred, so at least one gap is one period long. If more than half of the poses are

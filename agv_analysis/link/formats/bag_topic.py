@@ -24,6 +24,7 @@ from agv_analysis.link.measurement import (
     PacketOutcomes,
     on_grid,
 )
+from agv_analysis.recordings.sampling import period_of
 
 Times = NDArray[np.int64]
 
@@ -53,7 +54,7 @@ def _read(path: Path, options: Options) -> Measurement:
         known = ", ".join(f"{name} ({topic.count})" for name, topic in sorted(bag.topics.items()))
         asked = f"has no topic {options.topic}" if options.topic else "is a recording: name a topic with --topic"
         raise MeasurementError(f"{path}: {asked}; it has {known}")
-    return _of_topic(bag, topics[0])
+    return measure_topic(bag, topics[0], options.interval)
 
 
 def _stamps(rows: NDArray[np.void], name: str = "header.stamp") -> Times | None:
@@ -97,18 +98,27 @@ def _of_slots(bag: Bag, topics: list[str]) -> Measurement:
     )  # fmt: skip
 
 
-def _of_topic(bag: Bag, topic: str) -> Measurement:
-    rows = bag[topic]
-    if len(rows) < 3:
-        raise MeasurementError(f"{bag.path}: {topic} has {len(rows)} messages: too few for a period")
-    logged, stamps = rows["log_time_ns"].astype(np.int64), _stamps(rows)
+def measure_topic(bag: Bag, topic: str, period: float | None = None) -> Measurement:
+    """What was lost of a topic that is sent every `period` [s], by default what most of its messages are apart.
+
+    Raises MeasurementError if that has no answer.
+    """
+    logged = bag.log_times(topic)
+    if len(logged) < 3:
+        raise MeasurementError(f"{bag.path}: {topic} has {len(logged)} messages: too few for a period")
+    stamps = _stamps(bag.arrays[topic]) if topic in bag.arrays else None
+    notes = []
+    if stamps is not None and not stamps.all():
+        notes.append(f"{np.count_nonzero(stamps == 0)} messages have no stamp: the log times stand for all of them")
+        stamps = None
+    elif stamps is None:
+        notes.append("the messages have no stamps: the log times stand for them")
     times = logged if stamps is None else stamps
-    notes = ["the messages have no stamps: the log times stand for them"] if stamps is None else []
-    period = int(np.median(np.diff(np.unique(times))))
+    period = round(period / _NS) if period else round(period_of(np.asarray(np.diff(np.unique(times)), np.int64)))
     if period <= 0 or (int(times.max()) - int(times.min())) // period > _MOST:
         raise MeasurementError(f"{bag.path}: the stamps of {topic} are on no grid")
     seq = _places(times, period)
-    delay = np.full(len(rows), np.nan) if stamps is None else np.asarray((logged - stamps) * _NS, dtype=np.float64)
+    delay = np.full(len(logged), np.nan) if stamps is None else np.asarray((logged - stamps) * _NS, dtype=np.float64)
     if stamps is not None:
         notes.append("delays are from stamp to log, and as good as the clocks of robot and recorder agree")
     grid = on_grid(Numbered(seq, (delay,), (times - times.min()) * _NS), int(seq.min()), int(seq.max()), period * _NS)

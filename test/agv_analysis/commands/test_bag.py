@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 
@@ -170,6 +171,63 @@ def test_export_refuses_what_it_cannot_do(tmp_path: Path) -> None:
     there = agv_ncs("bag", "export", SAMPLE, "--npz", "--out", tmp_path / "there.npz")
     assert there.exit_code == 1
     assert "exists already" in there.stderr
+
+
+@pytest.mark.parametrize("form", ["stamped", "unknown type", "no stamps"])
+def test_outages_of_a_topic_are_those_that_were_left_out(tmp_path: Path, form: str) -> None:
+    """Every message of which the losses are known, logged up to 2 ms late, of any type."""
+    lost = [k for k in range(1000) if 100 <= k < 103 or k % 97 == 5 or 700 <= k < 720]
+    late = np.random.default_rng(4).integers(0, 2_000_000, 1000)
+    text = {"stamped": b"std_msgs/Header header\n" + b"=" * 80 + b"\nMSG: std_msgs/Header\n"
+            b"builtin_interfaces/Time stamp\nstring frame_id", "no stamps": b"int32 a\nuint32 b\nuint64 c"}  # fmt: skip
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("my_msgs/msg/Scan", "ros2msg", text.get(form, b""))
+        channel = writer.register_channel("/scan", "cdr", schema)
+        for k in range(1000):
+            if k not in lost:
+                ns = 10**9 + 10**7 * k
+                body = b"\0\1\0\0" + struct.pack("<iII", ns // 10**9, ns % 10**9, 1) + bytes(4)
+                writer.add_message(channel, ns + int(late[k]), body, ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    out = tmp_path / "out.json"
+    result = agv_ncs("bag", "outages", tmp_path / "a.mcap", "--topic", "/scan", "--json", out)
+    assert result.exit_code == 0
+    uplink = json.loads(out.read_text())["uplink"]
+    begins = sum(k - 1 not in lost for k in lost)
+    assert (uplink["packets"], uplink["lost"], uplink["outages"]) == (1000, len(lost), begins)
+    assert uplink["outage_max_s"] == pytest.approx(0.2, rel=0.05)
+    ages = [k - max((j for j in range(k + 1) if j not in lost), default=0) for k in range(1000)]
+    assert uplink["age"]["max_s"] == pytest.approx(0.01 * max(ages), rel=0.05)
+    assert uplink["age"]["mean_s"] == pytest.approx(0.01 * np.mean(ages), rel=0.05)
+    assert (uplink["delay"] is None) == (form != "stamped")
+    if form == "stamped":
+        assert uplink["delay"]["max_s"] == pytest.approx(late.max() * 1e-9, abs=1e-5)
+
+
+def test_outages_with_a_period_that_the_messages_do_not_show(tmp_path: Path) -> None:
+    """Only every third one came: their own distance is three periods."""
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/scan", "cdr", 0)
+        for k in range(0, 300, 3):
+            writer.add_message(channel, 10**9 + 10**7 * k, b"\0\1\0\0", 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    out = tmp_path / "out.json"
+    arguments = ("bag", "outages", tmp_path / "a.mcap", "--topic", "/scan", "--json", out)
+    assert agv_ncs(*arguments).exit_code == 0
+    assert json.loads(out.read_text())["uplink"]["lost"] == 0
+    assert agv_ncs(*arguments, "--period", "0.01").exit_code == 0
+    uplink = json.loads(out.read_text())["uplink"]
+    assert (uplink["packets"], uplink["lost"], uplink["outages"]) == (298, 198, 99)
+
+
+def test_outages_of_a_topic_that_is_not_there(tmp_path: Path) -> None:
+    result = agv_ncs("bag", "outages", SAMPLE, "--topic", "/nowhere")
+    assert result.exit_code == 1
+    assert "no topic /nowhere; it has /agv/cmd_vel" in result.stderr
 
 
 def test_recovery_of_a_whole_bag_is_that_bag(tmp_path: Path) -> None:
