@@ -21,6 +21,7 @@ setup(
     package_data={
         **{package: ["py.typed"] for package in ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs")},
         "agv_analysis.report": ["*.j2"],
+        "agv_analysis.requirements": ["*.yaml"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

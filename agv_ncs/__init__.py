@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from agv_analysis.bags import Bag, read_bag
     from agv_analysis.corridor.corridor import Corridor, corridor
     from agv_analysis.report.page import write_report
+    from agv_analysis.requirements.loop_requirements import LoopRequirements, require
     from agv_analysis.run import Run
     from agv_analysis.runtime.outcome import Outcome
     from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
@@ -46,6 +47,7 @@ __all__ = [
     "Analysis",
     "Bag",
     "Corridor",
+    "LoopRequirements",
     "Margins",
     "Observations",
     "Outcome",
@@ -70,6 +72,7 @@ __all__ = [
     "register_control_law",
     "register_staleness_policy",
     "register_vehicle",
+    "require",
     "run",
     "simulate",
     "simulate_batch",
@@ -102,6 +105,8 @@ _MODULES = {
     "Margins": "agv_analysis.stability.margins",
     "corridor": "agv_analysis.corridor.corridor",
     "Corridor": "agv_analysis.corridor.corridor",
+    "require": "agv_analysis.requirements.loop_requirements",
+    "LoopRequirements": "agv_analysis.requirements.loop_requirements",
     "write_report": "agv_analysis.report.page",
     "control_laws": "agv_ncs._parts",
     "vehicles": "agv_ncs._parts",

@@ -1,0 +1,179 @@
+"""`agv-ncs require`: what a loop asks of its radio, and whether a link gives it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from agv_analysis.commands import with_settings, write_json
+
+if TYPE_CHECKING:
+    from agv_analysis.requirements.link_availability import LinkAvailability
+    from agv_analysis.requirements.loop_requirements import LoopRequirements
+    from agv_analysis.requirements.service_classes import ServiceClass
+    from agv_analysis.scenario import Scenario
+
+
+@click.command("require")
+@with_settings
+@click.option("--link", "file", type=click.Path(path_type=Path), help="A measured link, as `agv-ncs link` reads it.")
+@click.option(
+    "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between its packets [s], if unsaid."
+)
+@click.option("--class", "name", help="A class of service: is it met, and would it do?")
+@click.option("--classes", "files", multiple=True, type=click.Path(path_type=Path), help="A file with more classes.")
+@click.option(
+    "--availability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True), help="Asked of the link."
+)
+@click.option("--mtbf", type=click.FloatRange(min=0.0, min_open=True), help="Mean time between failures [s], likewise.")
+@click.option("--survival-time", type=click.FloatRange(min=0.0), help="Offered [s]: does the loop hold, and how fast?")
+@click.option("--transfer-interval", type=click.FloatRange(min=0.0, min_open=True), help="Offered with it [s].")
+@click.option("--latency", type=click.FloatRange(min=0.0), default=0.0, help="Offered with it [s].")
+@click.option("--table", type=click.Path(path_type=Path), help="Write tables in Markdown to this file.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+def command(
+    params: str, settings: tuple[str, ...], file: Path | None, interval: float | None, name: str | None,
+    files: tuple[Path, ...], availability: float | None, mtbf: float | None, survival_time: float | None,
+    transfer_interval: float | None, latency: float, table: Path | None, json_file: Path | None,
+) -> None:  # fmt: skip
+    """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
+
+    Then what its uplink gives, or the measured link of --link, and which classes of service would do.
+
+    \b
+    Examples:
+      agv-ncs require config/outages.yaml --table requirements.md
+      agv-ncs require config/outages.yaml --link ping.txt --availability 0.999999
+      agv-ncs require config/outages.yaml --survival-time 0.05 --transfer-interval 0.01
+    """
+    from rich.console import Console
+
+    from agv_analysis.requirements.class_check import meets, would_do
+    from agv_analysis.requirements.loop_requirements import require
+    from agv_analysis.requirements.requirement_table import (
+        markdown,
+        rows_of_classes,
+        rows_of_link,
+        rows_of_loop,
+    )
+    from agv_analysis.requirements.service_classes import find_class, load_classes
+    from agv_analysis.scenario import load_scenario
+    from agv_ros.errors import UserError
+
+    if transfer_interval is not None and survival_time is None:
+        raise UserError("--transfer-interval is offered with a --survival-time: give one")
+    scenario = load_scenario(params, settings)
+    classes = load_classes(*files)
+    if name is not None:
+        classes = (find_class(name, classes),)
+    if availability is not None or mtbf is not None:
+        classes = (*classes, _asked(availability, mtbf))
+    console = Console(highlight=False)
+    with Console(stderr=True).status("computing what the loop asks ..."):
+        loop = require(scenario)
+        link = _link_of(scenario, loop, file, interval)
+    enough = {one.name: would_do(one, loop) for one in classes}
+    met = {one.name: meets(one, link) for one in classes}
+    sections: dict[str, list[tuple[str, ...]]] = {"What the loop asks of its radio": list(rows_of_loop(loop))}
+    if link is not None:
+        sections["What the link gives it"] = list(rows_of_link(link))
+    content: dict[str, Any] = {
+        **loop.to_json(),
+        **(dict.fromkeys(("availability", "unavailability", "mtbf_s")) if link is None else link.to_json()),
+        "meets": {one: answer for one, (answer, _) in met.items()},
+        "meets_reason": {one: why for one, (_, why) in met.items()},
+        "would_do": {one: answer for one, (answer, _) in enough.items()},
+        "would_do_reason": {one: why for one, (_, why) in enough.items()},
+        "classes": {one.name: one.source for one in classes},
+    }
+    if survival_time is not None:
+        offered = _on_service(scenario, survival_time, latency, transfer_interval)
+        sections["On the offered service"], content["offered"] = offered
+    sections["Classes of service"] = list(rows_of_classes(classes, enough, met))
+    _print(console, params, sections, loop)
+    if table is not None:
+        heads = dict.fromkeys(sections, ("", "")) | {"Classes of service": _HEAD}
+        _write(table, markdown(sections, heads))
+        console.print(f"table:   {table}")
+    if json_file is not None:
+        write_json(json_file, content)
+
+
+_HEAD = ("class", "source", "would it do for the loop?", "does the link meet it?")
+
+
+def _asked(availability: float | None, mtbf: float | None) -> ServiceClass:
+    """What the command line asks of the link, as a class."""
+    from agv_analysis.requirements.service_classes import SERVICE, ServiceClass
+
+    return ServiceClass(
+        "as asked", SERVICE, "own figures", "not recorded", "not recorded", True, availability=availability, mtbf_s=mtbf
+    )
+
+
+def _link_of(
+    scenario: Scenario, loop: LoopRequirements, file: Path | None, interval: float | None
+) -> LinkAvailability | None:
+    """What the measured link gives, or the scenario's uplink; None where nothing is known of it, or of the loop."""
+    from agv_analysis.link.formats import read_link
+    from agv_analysis.link.formats.format import Options
+    from agv_analysis.link.link_figures import LinkFigures
+    from agv_analysis.link.markov_channel import chain_of
+    from agv_analysis.link.measurement import LossRates, Measurement
+    from agv_analysis.requirements.link_availability import of_channel, of_measurement
+    from agv_ros.errors import UserError
+
+    slots = loop.survival_slots
+    uplink = scenario.relay.uplink
+    if file is not None:
+        reading = read_link(file, Options(interval))
+        if isinstance(reading, LossRates):
+            raise UserError(reading.refusal)
+        if isinstance(reading, Measurement):
+            survival = loop.survival_time
+            return None if survival is None or survival < 0.0 else of_measurement(LinkFigures(reading), survival)
+        uplink = reading.channel
+    chain = chain_of(uplink)
+    if slots is None or slots < 0 or chain is None:
+        return None
+    found = of_channel(chain, slots, scenario.plant.ts, uplink.delay + uplink.jitter)
+    return found if file is None else replace(found, assumption="the link is the channel of the line for netem")
+
+
+def _on_service(
+    scenario: Scenario, survival_time: float, latency: float, transfer_interval: float | None
+) -> tuple[list[tuple[str, ...]], dict[str, Any]]:
+    from agv_analysis.requirements.offered_service import OfferedService, on_service
+    from agv_analysis.requirements.requirement_table import rows_of_service
+
+    found = on_service(scenario, OfferedService(survival_time, latency, transfer_interval))
+    return list(rows_of_service(found)), found.to_json()
+
+
+def _print(
+    console: Any, params: str, sections: dict[str, list[tuple[str, ...]]], loop: LoopRequirements
+) -> None:  # fmt: skip
+    from rich.markup import escape
+    from rich.table import Table
+
+    for title, rows in sections.items():
+        console.print(f"[bold]{title}[/]" + (f" ({escape(params)})" if title.startswith("What the loop") else ""))
+        table = Table(box=None, show_header=len(rows[0]) > 2, pad_edge=False)
+        for column in _HEAD if len(rows[0]) > 2 else ("", ""):
+            table.add_column(column, style=None)
+        for row in rows:
+            table.add_row(*map(escape, row))
+        console.print(table)
+        console.print()
+    for line in loop.netem():
+        console.print(f"For netem, at the border: {line}", soft_wrap=True)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None

@@ -1,0 +1,101 @@
+"""Classes of radio service against a link and a loop: is it met, and would it do?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.requirements.link_availability import LinkAvailability
+from agv_analysis.requirements.loop_requirements import LoopRequirements
+from agv_analysis.requirements.service_classes import ServiceClass
+
+YES, NO, CANNOT_TELL = "yes", "no", "cannot tell"
+
+Answer = tuple[str, str]
+"""YES, NO or CANNOT_TELL, and why."""
+
+
+def meets(wanted: ServiceClass, link: LinkAvailability | None) -> Answer:
+    """Does a link give what a class asks, where a failure is an outage that the loop does not survive?
+
+    Figures of the class that are not asked of a link's losses and delays (data rates, sizes) are left out.
+    """
+    if link is None:
+        return CANNOT_TELL, "the link has no figures"
+    answers = []
+    if wanted.availability is not None:
+        answers.append(_at_most("unavailability", link.unavailability, 1.0 - wanted.availability, link))
+    if wanted.mtbf_s is not None:
+        answers.append(_at_least(link.mtbf, wanted.mtbf_s))
+    if wanted.largest_loss is not None:
+        answers.append(_at_most("loss rate", link.loss_rate, wanted.largest_loss, link))
+    if wanted.latency_s is not None:
+        answers.append(_latency(link.latency, wanted.latency_s))
+    return _all(answers)
+
+
+def would_do(offered: ServiceClass, loop: LoopRequirements) -> Answer:
+    """Would a service of this class be enough for a loop, but for the failures that the class itself allows?"""
+    if loop.infeasible:
+        return NO, "the loop does not settle even without losses"
+    answers: list[Answer] = []
+    if offered.latency_s is not None:
+        limit = loop.latency
+        fine = limit is None or offered.latency_s <= limit
+        answers.append((YES if fine else NO, f"latency {_ms(offered.latency_s)} against {_bound(limit)}"))
+    if offered.survival_time_s is not None:
+        limit = loop.survival_time
+        fine = limit is None or offered.survival_time_s <= limit
+        answers.append((YES if fine else NO, f"outages up to {_ms(offered.survival_time_s)} against {_bound(limit)}"))
+    elif offered.largest_loss is not None:
+        rate = loop.loss_rate
+        fine = rate is None or offered.largest_loss < rate
+        said = f"losses {offered.largest_loss:.4g} against {'no bound' if rate is None else format(rate, '.4g')}"
+        answers.append((YES if fine else NO, f"{said}, if they are independent"))
+    else:
+        answers.append((CANNOT_TELL, "the class does not say how long outages may last"))
+    return _all(answers)
+
+
+def _all(answers: Iterable[Answer]) -> Answer:
+    """No if one is, cannot tell if one cannot, else yes; with the reasons for it."""
+    found = list(answers)
+    if not found:
+        return CANNOT_TELL, "the class has no figure that could be compared"
+    for word in (NO, CANNOT_TELL):
+        reasons = [why for answer, why in found if answer == word]
+        if reasons:
+            return word, "; ".join(reasons)
+    return YES, "; ".join(why for _, why in found)
+
+
+def _at_most(name: str, seen: Estimate, limit: float, link: LinkAvailability) -> Answer:
+    said = f"{name} {seen.value:.4g}" + (f" ({seen.low:.4g} to {seen.high:.4g})" if seen.low < seen.high else "")
+    said += f", at most {limit:.4g}"
+    if seen.high <= limit * (1.0 + 1e-9):
+        return YES, said
+    if seen.low > limit:
+        return NO, said
+    more = link.more_packets(1.0 - limit) if name == "unavailability" else None
+    return CANNOT_TELL, said if more is None else f"{said}: {more} packets more without a failure would show it"
+
+
+def _at_least(seen: Estimate, limit: float) -> Answer:
+    said = f"mean time between failures {seen.value:.4g} s"
+    said += f" ({seen.low:.4g} s to {seen.high:.4g} s)" if seen.low < seen.high else ""
+    said += f", at least {limit:.4g} s"
+    return (YES if seen.low >= limit else NO if seen.high < limit else CANNOT_TELL), said
+
+
+def _latency(seen: float | None, limit: float) -> Answer:
+    if seen is None:
+        return CANNOT_TELL, "the link's delay is not known"
+    return (YES if seen <= limit else NO), f"latency {_ms(seen)}, at most {_ms(limit)}"
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.4g} ms"
+
+
+def _bound(limit: float | None) -> str:
+    return "no bound" if limit is None else _ms(limit)

@@ -1,0 +1,127 @@
+"""What a loop asks, a link gives and classes say, in rows: for the terminal, and as tables for a document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.requirements.class_check import Answer
+from agv_analysis.requirements.link_availability import LinkAvailability
+from agv_analysis.requirements.loop_requirements import LoopRequirements
+from agv_analysis.requirements.offered_service import OnService
+from agv_analysis.requirements.service_classes import ServiceClass
+
+Row = tuple[str, str]
+
+
+def rows_of_loop(found: LoopRequirements) -> Iterator[Row]:
+    """Name and value of each figure that a loop asks for."""
+    reasons = found.reasons
+    yield "Transfer interval", _ms(found.transfer_interval)
+    if found.infeasible:
+        yield "Everything else", f"nothing would do: {found.infeasible}"
+        return
+    slots, time = found.survival_slots, found.survival_time
+    yield (
+        "Survival time, by stability",
+        _said(
+            None if slots is None or time is None or slots < 0 else f"{_ms(time)} ({slots} slots)",
+            reasons,
+            "survival_time_s",
+        ),
+    )
+    yield (
+        "Maximum latency, without losses",
+        _said(None if found.latency is None else f"{_ms(found.latency)}", reasons, "latency_max_s"),
+    )
+    for delay, rate in found.delays:
+        if delay > 0.0:
+            yield f"Independent losses behind {_ms(delay)}", f"below {rate:.4g}"
+    yield (
+        "Independent losses, without delay",
+        _said(None if found.loss_rate is None else f"below {found.loss_rate:.4g}", reasons, "loss_rate_max"),
+    )
+    if found.mean_burst is not None:
+        yield "Mean burst at the uplink's loss rate", _burst(found.mean_burst, found.transfer_interval)
+    for rate, burst in found.bursts:
+        yield f"Mean burst at a loss rate of {rate:g}", _burst(burst, found.transfer_interval)
+    if found.mean_age is not None:
+        yield "Mean age of the pose", f"below {_ms(found.mean_age)}"
+
+
+def _said(text: str | None, reasons: Mapping[str, str], name: str) -> str:
+    reason = reasons.get(name, "")
+    if text is None:
+        return reason or "no answer"
+    return f"{text}; {reason}" if reason else text
+
+
+def _burst(burst: float | None, ts: float) -> str:
+    if burst is None:
+        return "none is short enough"
+    return "any" if math.isinf(burst) else f"below {burst:.4g} slots ({_ms(burst * ts)})"
+
+
+def rows_of_link(found: LinkAvailability) -> Iterator[Row]:
+    """Name and value of each figure that a link gives."""
+    yield "Availability", _share(found.availability)
+    yield "Unavailability", _estimate(found.unavailability)
+    yield "Mean time between failures", _estimate(found.mtbf, " s")
+    yield "Loss rate", _estimate(found.loss_rate)
+    if found.failures is not None:
+        yield "Failures seen", f"{found.failures} in {found.packets} packets"
+    yield "Assumed", found.assumption
+
+
+def _estimate(found: Estimate, unit: str = "") -> str:
+    def text(value: float) -> str:
+        return f"{value:.5g}{unit}" if math.isfinite(value) else "no end"
+
+    if math.isinf(found.value) and math.isinf(found.low):
+        return "no failure"
+    interval = "" if found.low == found.high else f" ({text(found.low)} to {text(found.high)})"
+    return ("none seen" if math.isinf(found.value) else text(found.value)) + interval
+
+
+def _share(found: Estimate) -> str:
+    """A share close to 1, with as many nines as it has."""
+
+    def text(value: float) -> str:
+        return f"{100.0 * value:.10g} %"
+
+    return text(found.value) + ("" if found.low == found.high else f" ({text(found.low)} to {text(found.high)})")
+
+
+def rows_of_service(found: OnService) -> Iterator[Row]:
+    """What the loop does on an offered service."""
+    yield "Does the loop hold?", f"{'yes' if found.holds else 'no'}: {found.why}"
+    speed = found.speed_max
+    yield "Largest speed, straight track", "no bound up to 50 m/s" if speed is None else f"{speed:.4g} m/s"
+    period = found.interval_max
+    yield "Largest transfer interval", "none" if period is None else _ms(period)
+    if found.kx_max is not None and found.kx_best is not None:
+        yield "K_x", f"below {found.kx_max:.4g} 1/s, {found.kx_best:.4g} 1/s is best"
+
+
+def rows_of_classes(
+    classes: Sequence[ServiceClass], enough: Mapping[str, Answer], met: Mapping[str, Answer]
+) -> Iterator[tuple[str, str, str, str]]:
+    """Name, source, would it do for the loop, does the link meet it."""
+    for one in classes:
+        yield one.name, one.source, ": ".join(enough[one.name]), ": ".join(met[one.name])
+
+
+def markdown(sections: Mapping[str, Sequence[Sequence[str]]], heads: Mapping[str, Sequence[str]]) -> str:
+    """Sections of rows as tables in Markdown."""
+    text = ""
+    for title, rows in sections.items():
+        head = heads[title]
+        lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+        lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
+        text += f"## {title}\n\n" + "\n".join(lines) + "\n\n"
+    return text.rstrip("\n") + "\n"
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.4g} ms"
