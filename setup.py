@@ -53,10 +53,13 @@ setup(
         # Sweeps on a Dask cluster, and results as Parquet.
         "cluster": ["distributed>=2023.1"],
         "parquet": ["pyarrow>=12.0"],
+        # Captures of packets as measured links.
+        "captures": ["dpkt>=1.9"],
         "test": [
             "colcon-common-extensions",
             "dash>=3.0",
             "distributed>=2023.1",
+            "dpkt>=1.9",
             "hypothesis>=6.80",
             "mcap-ros2-support>=0.5",
             "mypy>=1.10",

@@ -1,0 +1,120 @@
+"""Captures, written here packet by packet, with known losses."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agv_analysis.link.formats import read_link
+from agv_analysis.link.formats.capture import samples_of
+from agv_analysis.link.formats.format import Options
+from agv_analysis.link.measurement import Measurement, MeasurementError
+
+dpkt = pytest.importorskip("dpkt", reason="needs dpkt: pip install '.[captures]'")
+
+LOST = {3, 4, 17}
+N, INTERVAL, DELAY = 50, 0.005, 0.0021
+POSE, OTHER, BUILTIN = b"\x00\x00\x12\x03", b"\x00\x00\x13\x03", b"\x00\x01\x00\xc2"
+
+
+def rtps(number: int, entity: bytes = POSE, little: bool = True, lead: bytes = b"") -> bytes:
+    """One DATA submessage, as of the wire protocol, behind a header of 20 byte and perhaps another submessage."""
+    order = "<" if little else ">"
+    body = (
+        struct.pack(f"{order}HH", 0, 16)
+        + b"\x00" * 4
+        + entity
+        + struct.pack(f"{order}iI", number >> 32, number & 0xFFFFFFFF)
+    )
+    data = bytes([0x15, 0x04 | little]) + struct.pack(f"{order}H", len(body) + 8) + body + b"\x00" * 8
+    return b"RTPS\x02\x03\x01\x0f" + bytes(range(12)) + lead + data
+
+
+def info_ts() -> bytes:
+    return bytes([0x09, 1]) + struct.pack("<H", 8) + b"\x00" * 8
+
+
+def frame(payload: bytes, port: int = 7411) -> bytes:
+    udp = dpkt.udp.UDP(sport=5000, dport=port, data=payload)
+    udp.ulen = len(udp)
+    ip = dpkt.ip.IP(src=b"\x0a\x00\x00\x01", dst=b"\x0a\x00\x00\x02", p=dpkt.ip.IP_PROTO_UDP, data=udp)
+    return bytes(dpkt.ethernet.Ethernet(src=b"\x01" * 6, dst=b"\x02" * 6, data=ip))
+
+
+def write(path: Path, packets: Sequence[tuple[float, bytes]], new: bool = False) -> Path:
+    with open(path, "wb") as file:
+        writer = (dpkt.pcapng.Writer if new else dpkt.pcap.Writer)(file)
+        for time, data in packets:
+            writer.writepkt(data, time)
+    return path
+
+
+def measured(path: Path, options: Options | None = None) -> Measurement:
+    found = read_link(path, options)
+    assert isinstance(found, Measurement)
+    return found
+
+
+def test_samples_of_a_message() -> None:
+    writer = bytes(range(12)), POSE
+    assert list(samples_of(rtps(5))) == [(writer, 5)]
+    assert list(samples_of(rtps((7 << 32) + 9, little=False, lead=info_ts()))) == [(writer, (7 << 32) + 9)]
+    assert list(samples_of(b"something else")) == []
+    assert list(samples_of(rtps(5)[:30])) == []
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_numbers_that_are_missing_where_samples_arrive_were_lost(tmp_path: Path, new: bool) -> None:
+    packets = []
+    for i in range(N):
+        if i not in LOST:
+            packets.append((100.0 + i * INTERVAL, frame(rtps(i + 1, lead=info_ts()))))
+        if i % 10 == 0:
+            packets += [(100.0 + i * INTERVAL, frame(rtps(i + 1, entity))) for entity in (OTHER, BUILTIN)]
+    packets.append((100.0 + N * INTERVAL, frame(rtps(6))))  # again
+    found = measured(write(tmp_path / "capture", packets, new))
+    assert found.packets == N
+    assert found.uplink is not None
+    assert set(np.flatnonzero(found.uplink.lost).tolist()) == LOST
+    assert found.duplicates == 1
+    assert found.interval == pytest.approx(INTERVAL, abs=1e-5)
+    assert "one of 2: name another with --topic" in found.notes[0]
+    other = f"{bytes(range(12)).hex()}.{OTHER.hex()}"
+    assert int(measured(tmp_path / "capture", Options(topic=other)).whole.lost.sum()) == 36  # 1, 11, 21, 31, 41
+
+
+@pytest.mark.parametrize("is_rtps", [False, True])
+def test_captures_of_both_ends_are_matched(tmp_path: Path, is_rtps: bool) -> None:
+    payloads = [rtps(i + 1) if is_rtps else f"pose {i % 7}".encode() for i in range(N)]  # equal ones are told apart
+    lost = LOST if is_rtps else {49}  # which of equal ones was lost cannot be told, but that of the last
+    here = [(100.0 + i * INTERVAL, frame(payloads[i])) for i in range(N)]
+    here += [(100.0, frame(b"elsewhere", 9)) for _ in range(100)]
+    there = [(100.0 + i * INTERVAL + DELAY, frame(payloads[i])) for i in range(N) if i not in lost]
+    found = measured(
+        write(tmp_path / "sent.pcap", here), Options(received=write(tmp_path / "received.pcap", there))
+    )  # fmt: skip
+    assert found.packets == N
+    assert found.uplink is not None
+    assert set(np.flatnonzero(found.uplink.lost).tolist()) == lost
+    delay = found.uplink.delay
+    assert delay is not None
+    assert delay[~found.uplink.lost] == pytest.approx(DELAY, abs=2e-6)
+    assert "from 10.0.0.1:5000 to 10.0.0.2:7411" in found.notes[0]
+
+
+def test_a_capture_that_says_nothing_of_losses_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.pcap", [(1.0, frame(b"no numbers"))])
+    with pytest.raises(MeasurementError, match="has no samples of RTPS"):
+        read_link(path)
+    with pytest.raises(MeasurementError, match="no packet of it is in"):
+        read_link(path, Options(received=write(tmp_path / "y.pcap", [(1.0, frame(b"other"))])))
+
+
+def test_a_capture_that_was_cut_off_keeps_what_is_whole(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.pcap", [(1.0 + i, frame(rtps(i + 1))) for i in range(4)])
+    path.write_bytes(path.read_bytes()[:-20])
+    assert measured(path).packets == 3
