@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import with_settings, write_json
+from agv_analysis.commands import corridor_settings, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.requirements.link_availability import LinkAvailability
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 @click.command("require")
 @with_settings
+@click.option("--corridor", type=click.FloatRange(min=0.0, min_open=True), help="Stay within so much [m] as well.")
+@click.option("--corridor-along", type=click.FloatRange(min=0.0, min_open=True), help="So much [m] along the track.")
 @click.option("--link", "file", type=click.Path(path_type=Path), help="A measured link, as `agv-ncs link` reads it.")
 @click.option(
     "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between its packets [s], if unsaid."
@@ -35,9 +37,10 @@ if TYPE_CHECKING:
 @click.option("--table", type=click.Path(path_type=Path), help="Write tables in Markdown to this file.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
 def command(
-    params: str, settings: tuple[str, ...], file: Path | None, interval: float | None, name: str | None,
-    files: tuple[Path, ...], availability: float | None, mtbf: float | None, survival_time: float | None,
-    transfer_interval: float | None, latency: float, table: Path | None, json_file: Path | None,
+    params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
+    interval: float | None, name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
+    survival_time: float | None, transfer_interval: float | None, latency: float, table: Path | None,
+    json_file: Path | None,
 ) -> None:  # fmt: skip
     """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
 
@@ -47,6 +50,7 @@ def command(
     Examples:
       agv-ncs require config/outages.yaml --table requirements.md
       agv-ncs require config/outages.yaml --link ping.txt --availability 0.999999
+      agv-ncs require config/outages.yaml --corridor 0.25 --class "mobile operation panel, emergency stop"
       agv-ncs require config/outages.yaml --survival-time 0.05 --transfer-interval 0.01
     """
     from rich.console import Console
@@ -65,7 +69,7 @@ def command(
 
     if transfer_interval is not None and survival_time is None:
         raise UserError("--transfer-interval is offered with a --survival-time: give one")
-    scenario = load_scenario(params, settings)
+    scenario = load_scenario(params, (*settings, *corridor_settings(corridor, corridor_along)))
     classes = load_classes(*files)
     if name is not None:
         classes = (find_class(name, classes),)

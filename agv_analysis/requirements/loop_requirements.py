@@ -3,7 +3,8 @@
 The mapping to the terms of 3GPP TS 22.104: the transfer interval is T_s; the survival time is n T_s, n being the
 longest outage of which any sequence is survived; the maximum end-to-end latency is the delay margin; the service is
 unavailable while an outage exceeds the survival time, and reliability is the mean time between such failures. All of
-the uplink, with commands that arrive at once.
+the uplink, with commands that arrive at once. Within a corridor the survival time is shorter where outages that the
+loop survives lead out of it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.link.netem import to_netem
+from agv_analysis.requirements.corridor_survival import CorridorSurvival, survival_in_corridor
 from agv_analysis.requirements.loss_behind_delay import critical_loss_behind
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import floquet, joint_spectral_radius, lifted, mean_square
@@ -46,7 +48,8 @@ class LoopRequirements:
     transfer_interval: float
     """T_s [s]."""
     survival_slots: int | None
-    """n, the longest outage [slots] of which any sequence is survived; -1: not even a loop without losses contracts."""
+    """n, the longest outage [slots] of which any sequence is survived, by stability and within the corridor if there is
+    one; -1: not even a loop without losses contracts, or stays within the corridor."""
     latency: float | None
     """Largest constant delay of the pose [s], without losses."""
     loss_rate: float | None
@@ -59,6 +62,10 @@ class LoopRequirements:
     """(loss rate, mean burst [slots] below which the mean square dies out; inf: any, None: none is short enough)."""
     delays: tuple[tuple[float, float], ...] = ()
     """(constant delay [s], independent losses that are taken on top of it)."""
+    stable_slots: int | None = None
+    """n by stability alone."""
+    corridor: CorridorSurvival | None = None
+    """What outages keep the AGV within its corridor; None if it has none."""
     infeasible: str = ""
     """Why the loop does not settle even without losses; then nothing is asked, since nothing would do."""
     reasons: dict[str, str] = field(default_factory=dict)
@@ -88,6 +95,12 @@ class LoopRequirements:
             "transfer_interval_s": self.transfer_interval,
             "survival_time_s": self.survival_time,
             "survival_slots": self.survival_slots,
+            "survival_slots_by_stability": self.stable_slots,
+            "corridor": None if self.corridor is None else {
+                "half_width_m": self.corridor.half_width,
+                "n_single": self.corridor.single,
+                "n_any": self.corridor.any_sequence,
+            },
             "latency_max_s": self.latency,
             "loss_rate_max": self.loss_rate,
             "mean_burst_max": self.mean_burst,
@@ -112,9 +125,9 @@ def _rounded(value: float) -> float:
 
 
 def require(scenario: Scenario) -> LoopRequirements:
-    """What a scenario's loop asks of its radio by stability, whatever its links are.
+    """What a scenario's loop asks of its radio by stability and within its corridor, whatever its links are.
 
-    Raises TrackFileError if the track's file cannot be used.
+    Raises TrackFileError if the track's file cannot be used, PartError if a part raises.
     """
     ts = scenario.plant.ts
     try:
@@ -122,20 +135,29 @@ def require(scenario: Scenario) -> LoopRequirements:
     except NoNominalMotionError as error:
         return LoopRequirements(ts, None, None, None, None, None, infeasible=str(error))
     reasons: dict[str, str] = {}
-    slots = _survival(loop, reasons)
+    stable = _survival(loop, reasons)
+    corridor = survival_in_corridor(scenario, stable)
     longest = _longest_delay(loop)
     rate = _loss_rate(loop, reasons)
     return LoopRequirements(
         transfer_interval=ts,
-        survival_slots=slots,
+        survival_slots=_smaller(stable, None if corridor is None else corridor.any_sequence),
         latency=_latency(loop, longest, reasons),
         loss_rate=rate,
         mean_burst=_mean_burst(scenario, loop, reasons),
         mean_age=None if rate is None or rate >= 1.0 else max(0.0, rate / (1.0 - rate)) * ts,
         bursts=_bursts(loop),
         delays=_losses_behind_delays(loop, longest, reasons),
+        stable_slots=stable,
+        corridor=corridor,
         reasons=reasons,
     )
+
+
+def _smaller(one: int | None, other: int | None) -> int | None:
+    """The smaller of two numbers of slots, None being no bound."""
+    known = [slots for slots in (one, other) if slots is not None]
+    return min(known) if known else None
 
 
 def _survival(loop: LinearLoop, reasons: dict[str, str]) -> int | None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.requirements.corridor_survival import deviation_after
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_analysis.stability import floquet, joint_spectral_radius
 from agv_analysis.stability.derived_loop import is_kanayamas_law, linear_loop
@@ -54,6 +55,9 @@ class OnService:
     """Largest sampling period that survives the same time [s], straight track, top speed; None: none does."""
     kx_max: float | None
     """Largest gain K_x [1/s] along a straight track, of Kanayama's law; None for another."""
+    deviation: float
+    """Largest distance from the reference [m] after one outage of the survival time, from anywhere on the lap; inf: the
+    loop diverges."""
     kx_best: float | None
     """The gain that makes the worst repeated outage die out fastest."""
 
@@ -64,6 +68,7 @@ class OnService:
             "holds_reason": self.why,
             "speed_max_mps": self.speed_max,
             "transfer_interval_max_s": self.interval_max,
+            "corridor_m": self.deviation if math.isfinite(self.deviation) else None,
             "kx_max": self.kx_max,
             "kx_best": self.kx_best,
         }
@@ -85,6 +90,7 @@ def on_service(scenario: Scenario, offered: OfferedService) -> OnService:
         why=why,
         speed_max=_largest(lambda v: _holds_on_line(found, v, n, offered.latency), _FASTEST),
         interval_max=_largest_interval(found, max(top, 1e-3), offered),
+        deviation=deviation_after(found, n),
         kx_max=kx_max,
         kx_best=kx_best,
     )

@@ -22,32 +22,32 @@ def rows_of_loop(found: LoopRequirements) -> Iterator[Row]:
     if found.infeasible:
         yield "Everything else", f"nothing would do: {found.infeasible}"
         return
-    slots, time = found.survival_slots, found.survival_time
-    yield (
-        "Survival time, by stability",
-        _said(
-            None if slots is None or time is None or slots < 0 else f"{_ms(time)} ({slots} slots)",
-            reasons,
-            "survival_time_s",
-        ),
-    )
-    yield (
-        "Maximum latency, without losses",
-        _said(None if found.latency is None else f"{_ms(found.latency)}", reasons, "latency_max_s"),
-    )
-    for delay, rate in found.delays:
+    ts, slots, corridor = found.transfer_interval, found.stable_slots, found.corridor
+    stable = None if slots is None or slots < 0 else _slots(slots, ts)
+    yield "Survival time, by stability", _said(stable, reasons, "survival_time_s")
+    if corridor is not None:
+        within = f"Survival time, within {corridor.half_width:g} m"
+        yield within, _slots(corridor.any_sequence, ts)
+        yield f"{within}, one outage alone", _slots(corridor.single, ts)
+    latency = None if found.latency is None else _ms(found.latency)
+    yield "Maximum latency, without losses", _said(latency, reasons, "latency_max_s")
+    for delay, loss in found.delays:
         if delay > 0.0:
-            yield f"Independent losses behind {_ms(delay)}", f"below {rate:.4g}"
-    yield (
-        "Independent losses, without delay",
-        _said(None if found.loss_rate is None else f"below {found.loss_rate:.4g}", reasons, "loss_rate_max"),
-    )
+            yield f"Independent losses behind {_ms(delay)}", f"below {loss:.4g}"
+    rate = None if found.loss_rate is None else f"below {found.loss_rate:.4g}"
+    yield "Independent losses, without delay", _said(rate, reasons, "loss_rate_max")
     if found.mean_burst is not None:
         yield "Mean burst at the uplink's loss rate", _burst(found.mean_burst, found.transfer_interval)
-    for rate, burst in found.bursts:
-        yield f"Mean burst at a loss rate of {rate:g}", _burst(burst, found.transfer_interval)
+    for loss, burst in found.bursts:
+        yield f"Mean burst at a loss rate of {loss:g}", _burst(burst, found.transfer_interval)
     if found.mean_age is not None:
         yield "Mean age of the pose", f"below {_ms(found.mean_age)}"
+
+
+def _slots(slots: int | None, ts: float) -> str:
+    if slots is None:
+        return "all that were tried"
+    return "none: the AGV is outside without any" if slots < 0 else f"{_ms(slots * ts)} ({slots} slots)"
 
 
 def _said(text: str | None, reasons: Mapping[str, str], name: str) -> str:
@@ -100,6 +100,8 @@ def rows_of_service(found: OnService) -> Iterator[Row]:
     yield "Largest speed, straight track", "no bound up to 50 m/s" if speed is None else f"{speed:.4g} m/s"
     period = found.interval_max
     yield "Largest transfer interval", "none" if period is None else _ms(period)
+    if math.isfinite(found.deviation):
+        yield "Corridor that it keeps in one outage", f"{found.deviation:.3g} m"
     if found.kx_max is not None and found.kx_best is not None:
         yield "K_x", f"below {found.kx_max:.4g} 1/s, {found.kx_best:.4g} 1/s is best"
 

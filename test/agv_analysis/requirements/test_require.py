@@ -138,6 +138,19 @@ def test_behind_an_exact_predictor_nothing_is_too_long() -> None:
     assert "no bound" in found.reasons["survival_time_s"]
 
 
+def test_a_corridor_shortens_the_survival_time() -> None:
+    """One outage of n slots leads a v T_s n (n + 1) / 2 along a line: the largest n within 0.1 m, and the inverse."""
+    scenario = of(25.0, "error_detector.corridor=0.1", "plant.initial_pose=[0.0, 0.0, 1.5707963267948966]")
+    found = require(scenario)
+    deviations = [0.125 * 0.005 * n * (n + 1) / 2.0 for n in range(30)]
+    n = max(n for n, deviation in enumerate(deviations) if deviation <= 0.1)
+    assert found.corridor is not None
+    assert found.corridor.single == n
+    assert found.corridor.any_sequence is not None
+    assert found.survival_slots == min(14, found.corridor.any_sequence)
+    assert on_service(scenario, OfferedService(0.05)).deviation == pytest.approx(deviations[10], rel=1e-3)
+
+
 # -- classes -----------------------------------------------------------------------------------------------------------
 
 
