@@ -12,8 +12,8 @@ from typing import Any
 import click
 
 COMMANDS = (
-    "run", "analyse", "stability", "channel", "link", "require", "parameters", "simulate", "explore", "sweep", "bag",
-    "replay", "reproduce",
+    "run", "analyse", "stability", "channel", "link", "probe", "require", "parameters", "simulate", "explore", "sweep",
+    "bag", "replay", "reproduce",
 )  # fmt: skip
 
 

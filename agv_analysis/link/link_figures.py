@@ -14,6 +14,7 @@ from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
 from agv_analysis.link.measurement import LossRates, Measurement, PacketOutcomes, Setting
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.resampling import weights
+from agv_analysis.metrics.confidence import CONFIDENCE
 from agv_analysis.metrics.outages import ages, outage_begins, outage_lengths
 from agv_analysis.run import Floats
 from agv_ros.parameters import as_dict
@@ -75,8 +76,16 @@ class DirectionFigures:
 
     @property
     def loss_rate(self) -> Estimate | None:
-        """Share of the packets that was lost, None where the file cannot tell."""
-        return self.fit.loss_rate if self.is_told else None
+        """Share of the packets that was lost, None where the file cannot tell.
+
+        Its interval knows bursts. Where nothing was lost nothing is known of bursts: then it is that of independent
+        packets, one-sided.
+        """
+        if not self.is_told:
+            return None
+        if not self.count_lost:
+            return Estimate(0.0, 0.0, 1.0 - (1.0 - CONFIDENCE) ** (1.0 / len(self.k)))
+        return self.fit.loss_rate
 
     @cached_property
     def outages(self) -> Floats:

@@ -7,8 +7,9 @@ outage between two packets that both came through was not seen, and is not playe
 one median interval more; then it begins again, or what `trace_end` says.
 
 A file has a column `time` [s], increasing, and `lost` (0, 1) or `verdict`, or `uplink_lost` and `downlink_lost`; and
-where messages were late `delay`, or `uplink_delay` and `downlink_delay` [s], empty or nan for what was lost. A file
-without times has a row a slot, as ever.
+where messages were late `delay`, or `uplink_delay` and `downlink_delay` [s], empty or nan for what was lost. An outcome
+that is nan is not known, since nothing was sent this way: it is what was known before. A file without times has a row a
+slot, as ever.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ TIME = "time"
 _EARLY = 1e-9
 """Share of a slot by which a slot may come before the packet that it belongs to: times are rounded."""
 
-_WORDS = {"0": 0.0, "1": 1.0, "0.0": 0.0, "1.0": 1.0, "delivered": 0.0, "lost": 1.0}
+_WORDS = {"0": 0.0, "1": 1.0, "0.0": 0.0, "1.0": 1.0, "delivered": 0.0, "lost": 1.0, "nan": math.nan}
 
 
 class Trace(NamedTuple):
@@ -209,11 +210,17 @@ def _text(cell: object) -> str:
     return str(int(cell)) if isinstance(cell, bool) else str(cell)
 
 
+def _held(flags: Floats) -> Floats:
+    """What is not known of a packet, NaN, is what was known before it; at the beginning that none was lost."""
+    last = np.maximum.accumulate(np.where(np.isnan(flags), -1, np.arange(len(flags))))
+    return np.where(last >= 0, flags[np.maximum(last, 0)], 0.0)
+
+
 def _checked(rows: Floats, path: str) -> Trace:
     """A trace from columns time, lost and perhaps delay. Raises TraceError naming the row."""
     if not len(rows):
         raise TraceError(f"{path}: no rows below the header")
-    time, flags = rows[:, 0], rows[:, 1]
+    time, flags = rows[:, 0], _held(rows[:, 1])
     bad = np.flatnonzero(~np.isin(flags, (0.0, 1.0)))
     if len(bad):
         raise TraceError(f"{path}: row {bad[0] + 1}: lost must be 0 or 1, found {flags[bad[0]]:g}")

@@ -5,7 +5,8 @@
     sent, received       when it was sent and when it arrived [s]; lost where `received` is empty
     lost, received       0/1, true/false, yes/no, or a word: lost, delivered, received, ok
     delay, rtt           one way, there and back again [s]; lost where both are empty and nothing else says it
-    uplink_lost, downlink_lost, uplink_delay, downlink_delay       the same of each direction
+    uplink_lost, downlink_lost, uplink_delay, downlink_delay       the same of each direction; lost is nan where nothing
+                         was sent this way, since what it would have answered was lost
 
 A name may end with its unit, as in `rtt_ms`; tshark's own names are known, and options name any others. The separator
 is a comma, a semicolon, a tabulator or a bar, whichever splits the header into most names.
@@ -25,6 +26,7 @@ from agv_analysis.link.formats.rows import floats_at
 from agv_analysis.link.formats.text_columns import Block, Bytes, Places, blocks, cells, head_of
 from agv_analysis.link.measurement import (
     LOST,
+    NOT_SENT,
     RECEIVED,
     UNKNOWN,
     Codes,
@@ -255,7 +257,7 @@ def _outcomes(
     """Uplink, downlink and round trip of a table without a round trip or without directions."""
     if values.keys() & {"uplink_lost", "downlink_lost"}:
         up, down = (
-            PacketOutcomes(_codes(values[f"{way}_lost"]), values.get(f"{way}_delay"))
+            PacketOutcomes(_codes(values[f"{way}_lost"], NOT_SENT), values.get(f"{way}_delay"))
             if f"{way}_lost" in values else None
             for way in ("uplink", "downlink")
         )  # fmt: skip
@@ -281,8 +283,9 @@ def _outcomes(
     return PacketOutcomes(codes, delay), None, None
 
 
-def _codes(flags: Floats) -> Codes:
-    return np.where(np.isnan(flags), UNKNOWN, np.where(flags != 0.0, LOST, RECEIVED)).astype(np.int8)
+def _codes(flags: Floats, untold: int = UNKNOWN) -> Codes:
+    """Outcomes of flags, `untold` where there is none."""
+    return np.where(np.isnan(flags), untold, np.where(flags != 0.0, LOST, RECEIVED)).astype(np.int8)
 
 
 def _are_flags(column: Floats) -> bool:

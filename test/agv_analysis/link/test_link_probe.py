@@ -1,0 +1,234 @@
+"""The link from both ends: real sockets on loopback, a relay that loses what it is told to, two network namespaces."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agv_analysis.link.formats import read_link
+from agv_analysis.link.link_figures import LinkFigures
+from agv_analysis.link.link_probe import SMALLEST, ProbeError, listen, measure, rows_of
+from agv_analysis.link.measurement import Measurement
+from agv_plant.channels.timed_trace import read_trace
+
+AgvNcs = Callable[..., tuple[int, str]]
+PACKET, ANSWER = 3, 4
+"""Kinds of the protocol."""
+
+
+@contextlib.contextmanager
+def listening(peer: str | None = None) -> Iterator[tuple[int, list[tuple[int, int]]]]:
+    """The port of an edge that answers one session, and where it says what it did."""
+    ports: list[int] = []
+    is_ready, done = threading.Event(), list[tuple[int, int]]()
+
+    def ready(port: int) -> None:
+        ports.append(port)
+        is_ready.set()
+
+    def serve() -> None:
+        done.append(listen(0, "127.0.0.1", peer, seconds=20.0, sessions=1, ready=ready))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    assert is_ready.wait(10.0)
+    yield ports[0], done
+    thread.join(30.0)
+    assert not thread.is_alive()
+
+
+class Lossy:
+    """A relay on loopback that drops packets of known numbers, of each direction."""
+
+    def __init__(self, port: int, up: set[int], down: set[int]) -> None:
+        self.drop = {PACKET: up, ANSWER: down}
+        self._front = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._front.bind(("127.0.0.1", 0))
+        self._back = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._back.connect(("127.0.0.1", port))
+        self.port = self._front.getsockname()[1]
+        self._ends, self._stop = os.pipe()
+        self._thread = threading.Thread(target=self._pass_on)
+        self._thread.start()
+
+    def _pass_on(self) -> None:
+        client = None
+        while True:
+            ends = {one.fileno(): one for one in (self._front, self._back)}
+            ready = select.select([*ends, self._ends], [], [])[0]
+            if self._ends in ready:
+                return
+            for one in (ends[ready_one] for ready_one in ready):
+                data, address = one.recvfrom(65536)
+                if one is self._front:
+                    client = address
+                if data[4] in self.drop and int.from_bytes(data[21:25], "big") in self.drop[data[4]]:
+                    continue
+                if one is self._front:
+                    self._back.send(data)
+                elif client is not None:
+                    self._front.sendto(data, client)
+
+    def close(self) -> None:
+        os.write(self._stop, b"x")
+        self._thread.join()
+        for one in (self._front, self._back):
+            one.close()
+        for end in (self._ends, self._stop):
+            os.close(end)
+
+
+def test_what_is_lost_on_which_way_is_known_exactly(tmp_path: Path) -> None:
+    up, down = {3, 4, 5, 60, 99}, {10, 11, 70, 98}
+    with listening() as (port, done):
+        relay = Lossy(port, up, down)
+        try:
+            found = measure("127.0.0.1", relay.port, count=100, interval=0.001)
+        finally:
+            relay.close()
+    assert found.is_listed
+    assert {i for i, arrived in enumerate(found.arrived) if arrived is None} == up
+    assert {i for i, returned in enumerate(found.returned) if returned is None} == up | down
+    assert done == [(100 - len(up), 0)]
+    path = tmp_path / "probe.csv"
+    path.write_text("\n".join(rows_of(found)) + "\n")
+    measured = read_link(path)
+    assert isinstance(measured, Measurement)
+    figures = LinkFigures(measured).to_json()
+    assert figures["packets"] == 100
+    assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(0.05)
+    assert figures["downlink"]["loss_rate"]["value"] == pytest.approx(4 / 95)
+    assert figures["interval_s"] == pytest.approx(0.001, rel=0.5)
+    # Both clocks are one: the delays of both ways are small, and none is negative by more than rounding.
+    assert 0.0 <= figures["uplink"]["delay"]["p50_s"] < 0.5
+    assert abs(found.offset[0]) < 0.5e9
+    trace = read_trace(str(path), "downlink")
+    lost = set(np.flatnonzero(trace.lost).tolist())
+    assert lost == down | {99}  # its last packet was not sent at all, and is what the one before it was
+    assert set(np.flatnonzero(read_trace(str(path), "uplink").lost).tolist()) == up
+
+
+def test_nobody_but_the_peer_is_answered() -> None:
+    with listening(peer="127.0.0.1") as (port, done), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.bind(("127.0.0.2", 0))
+        for data in (
+            b"",
+            b"hello",
+            b"AGVP",
+            b"AGVP\x01" + bytes(60),
+            b"AGVP\x03" + bytes(60),
+            b"AGVP\x05" + bytes(1300),
+        ):
+            stranger.sendto(data, ("127.0.0.1", port))
+        assert not select.select([stranger], [], [], 0.2)[0]
+        measure("127.0.0.1", port, count=20, interval=0.001)
+        assert not select.select([stranger], [], [], 0.0)[0]
+    assert done == [(20, 6)]
+
+
+def test_an_answer_is_never_longer_than_what_it_answers() -> None:
+    """So an edge that listens makes no attack on others larger; and a made-up sender gets no session."""
+    with listening() as (port, _), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.connect(("127.0.0.1", port))
+        hello = b"AGVP\x01" + bytes(8 + 8)
+        for length in (21, 33, 64):
+            other.send(hello.ljust(length, b"\0"))
+            assert select.select([other], [], [], 5.0)[0]
+            assert len(other.recv(65536)) <= length
+        for kind in (PACKET, 5):  # without the number that was told
+            other.send((b"AGVP" + bytes([kind]) + bytes(16)).ljust(1400, b"\0"))
+        assert not select.select([other], [], [], 0.2)[0]
+        measure("127.0.0.1", port, count=5, interval=0.001, size=SMALLEST)
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [({"count": 0}, "1 to 2000000 packets"), ({"interval": 1e-5}, "0.0005 s apart"), ({"size": 5000}, "1400 byte")],
+)
+def test_rate_and_size_are_bounded(more: dict[str, float], complaint: str) -> None:
+    with pytest.raises(ProbeError, match=complaint):
+        measure("127.0.0.1", 9, **more)  # type: ignore[arg-type]
+
+
+def _namespaces_with_netem() -> str:
+    """Why two network namespaces with netem cannot be had here; empty if they can."""
+    if os.geteuid() != 0 or not (shutil.which("ip") and shutil.which("tc")):
+        return "needs root, ip and tc"
+    made = subprocess.run(["ip", "netns", "add", "agvprobe0"], capture_output=True, text=True)
+    if made.returncode:
+        return f"needs network namespaces: {made.stderr.strip()}"
+    try:
+        enter = ["ip", "netns", "exec", "agvprobe0"]
+        asked = [*enter, "tc", "qdisc", "add", "dev", "lo", "root", "netem", "loss", "1%"]
+        tried = subprocess.run(asked, capture_output=True, text=True)
+        return f"needs netem in the kernel: {tried.stderr.strip()}" if tried.returncode else ""
+    finally:
+        subprocess.run(["ip", "netns", "del", "agvprobe0"], check=False)
+
+
+def test_two_network_namespaces_with_netem(tmp_path: Path) -> None:
+    reason = _namespaces_with_netem()
+    if reason:
+        pytest.skip(reason)
+
+    def run(*words: str) -> None:
+        subprocess.run(words, check=True, capture_output=True)
+
+    ends = (("agvprobe1", "agvp1", "10.213.7.1/24"), ("agvprobe2", "agvp2", "10.213.7.2/24"))
+    cli = [sys.executable, "-m", "agv_analysis.cli", "probe"]
+    try:
+        for name, _, _ in ends:
+            run("ip", "netns", "add", name)
+        run("ip", "link", "add", "agvp1", "netns", "agvprobe1", "type", "veth", "peer", "agvp2", "netns", "agvprobe2")
+        for name, link, address in ends:
+            run("ip", "-n", name, "addr", "add", address, "dev", link)
+            run("ip", "-n", name, "link", "set", link, "up")
+        enter = ["ip", "netns", "exec", "agvprobe1"]
+        run(*enter, "tc", "qdisc", "add", "dev", "agvp1", "root", "netem", "delay", "20ms", "loss", "20%")
+        edge = subprocess.Popen(
+            ["ip", "netns", "exec", "agvprobe2", *cli, "--listen", "--seconds", "60"], stdout=subprocess.PIPE
+        )
+        try:
+            assert edge.stdout is not None
+            assert b"listening" in edge.stdout.readline()
+            path = tmp_path / "link.csv"
+            run(*enter, *cli, "10.213.7.2", "--duration", "4", "--interval", "0.002", "--trace", str(path))
+        finally:
+            edge.terminate()
+            edge.wait()
+        found = read_link(path)
+        assert isinstance(found, Measurement)
+        figures = LinkFigures(found).to_json()
+        assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(0.2, abs=0.06)
+        assert figures["downlink"]["loss_rate"]["value"] < 0.01
+        assert figures["uplink"]["delay"]["p50_s"] + figures["downlink"]["delay"]["p50_s"] == pytest.approx(
+            0.02, abs=0.01
+        )
+    finally:
+        for name, _, _ in ends:
+            subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
+
+
+def test_the_command(tmp_path: Path, agv_ncs: AgvNcs) -> None:
+    path = tmp_path / "link.csv"
+    with listening() as (port, _):
+        status, said = agv_ncs(
+            "probe", "127.0.0.1", "--port", port, "--duration", "0.1", "--interval", "0.002", "--trace", path
+        )  # fmt: skip
+    assert status == 0, said
+    assert "50 packets, 0 lost on the way up, 0 on the way down" in said
+    assert len(path.read_text().splitlines()) == 51
+    status, said = agv_ncs("probe")
+    assert status == 2
+    assert "either --listen, or the HOST that listens" in said
