@@ -52,6 +52,7 @@ def command(
     Examples:
       agv-ncs link ping.txt --picture link.png
       agv-ncs link irtt.json config/outages.yaml --json link.json
+      agv-ncs link "delay 20ms 5ms loss 1% 25%"
       agv-ncs link capture.csv --column time=frame.time_epoch --column seq=icmp.seq --trace trace.csv
     """
     from rich.console import Console
@@ -87,7 +88,11 @@ def _read(file: Path, options: Any, name: str) -> Reading:
     """Read a file, a long one under a progress bar."""
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.link.formats import read_link
+    from agv_analysis.link.formats.netem_line import setting
+    from agv_analysis.link.netem_text import is_netem
 
+    if not file.exists() and is_netem(str(file)):
+        return setting(str(file), "the command line")
     if not file.is_file() or file.stat().st_size < _LONG:
         return read_link(file, options, name)
     from dataclasses import replace

@@ -193,23 +193,26 @@ def on_grid(found: Numbered, first: int, last: int, interval: float) -> Grid:
     """
     count = last - first + 1
     rows = found.seq - first
-    _, at = np.unique(rows, return_index=True)  # the first record of each number counts
-    at = at[(rows[at] >= 0) & (rows[at] < count)]
-    places = rows[at]
-    outcome = np.full(count, LOST, dtype=np.int8)
-    outcome[places] = RECEIVED
+    is_known = (rows >= 0) & (rows < count)
+    record = np.full(count, -1, dtype=np.int64)
+    known = np.flatnonzero(is_known)[::-1]
+    record[rows[known]] = known  # the first record of each number counts: it is written last
+    places = np.flatnonzero(record >= 0)
+    at = record[places]
+    outcome = np.where(record >= 0, RECEIVED, LOST).astype(np.int8)
     delays = []
     for given in found.delays:
         delay = np.full(count, np.nan)
         delay[places] = given[at]
         delays.append(delay)
-    in_order = np.sort(at)
-    seen = rows[in_order]
+    is_first = np.zeros(len(rows), dtype=np.bool_)
+    is_first[at] = True
+    seen = rows[is_first]
     return Grid(
         sent=_times(found.sent, at, places, count, interval),
         outcome=outcome,
         delays=tuple(delays),
-        duplicates=len(rows) - len(np.unique(rows)),
+        duplicates=len(known) - len(at),
         reordered=int(np.count_nonzero(seen < np.maximum.accumulate(seen))) if len(seen) else 0,
     )
 
@@ -218,27 +221,32 @@ def _times(
     sent: Floats | None, at: NDArray[np.int64], places: NDArray[np.int64], count: int, interval: float
 ) -> Floats:
     """When each packet was sent [s] since the first, shape (count,), increasing."""
-    k = np.arange(count, dtype=np.float64)
-    if sent is None or np.isnan(sent[at]).all():
-        return k * interval
-    known = ~np.isnan(sent[at])
-    x, y = places[known].astype(np.float64), sent[at][known]
-    if len(x) == 1:
-        return k * interval
-    step = (y[-1] - y[0]) / (x[-1] - x[0])
-    times = np.interp(k, x, y)
-    times = np.where(k < x[0], y[0] + (k - x[0]) * step, np.where(k > x[-1], y[-1] + (k - x[-1]) * step, times))
+    if sent is None:
+        return np.arange(count, dtype=np.float64) * interval
+    stamps = sent[at]
+    known = ~np.isnan(stamps)
+    x, y = places[known], stamps[known]
+    if len(x) < 2:
+        return np.arange(count, dtype=np.float64) * interval
+    step = float(y[-1] - y[0]) / float(x[-1] - x[0])
+    times = np.interp(np.arange(count, dtype=np.float64), x, y)
+    first, last = int(x[0]), int(x[-1])
+    times[:first] = y[0] + step * np.arange(-first, 0)
+    times[last + 1 :] = y[-1] + step * np.arange(1, count - last)
+    times -= times[0]
     # Time stamps are rounded, and a reply that is printed late dates its packet late: order is that of the numbers.
-    return np.asarray(np.maximum.accumulate(times - times[0]))
+    return np.maximum.accumulate(times, out=times)
 
 
 def unwrapped(seq: NDArray[np.int64], modulus: int = 65536) -> NDArray[np.int64]:
     """Numbers that begin anew after `modulus` - 1, made to count on; replies out of order stay out of order."""
     if len(seq) == 0 or int(seq.max()) >= modulus:
         return seq
-    steps = np.diff(seq)
-    steps -= modulus * np.round(steps / modulus).astype(np.int64)
-    return np.asarray(seq[0] + np.concatenate(([0], np.cumsum(steps))))
+    steps = np.diff(seq, prepend=seq[0])
+    wraps = np.flatnonzero(np.abs(steps) > modulus // 2)
+    steps[wraps] -= modulus * np.sign(steps[wraps])
+    steps[0] = seq[0]
+    return np.cumsum(steps, out=steps)
 
 
 def needs_packets(count: int, source: str, what: str) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import re
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ from agv_analysis.run import Floats
 _BEGIN = re.compile(r'"round_trips"\s*:\s*\[')
 _INTERVAL = re.compile(r'"interval"\s*:\s*(\d+)')
 _NS = 1e-9
+_COLUMNS = 8
+"""Numbers of a round trip, see `_row`."""
 
 _WAYS = {
     "false": (RECEIVED, RECEIVED),
@@ -52,16 +55,16 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed, rows, stated = Malformed(), [], [0.0]
+    malformed, rows, stated = Malformed(), array("d"), [0.0]
     for number, member in enumerate(_members(path, options.progress, malformed, stated), start=1):
         row = _row(member)
         if row is None:
             malformed.add(number, json.dumps(member).encode())
         else:
-            rows.append(row)
+            rows.extend(row)
     if not rows:
         raise MeasurementError(f"{path}: has no round trips: was irtt stopped before it wrote them?")
-    table = np.array(rows, dtype=np.float64)
+    table = np.frombuffer(rows).reshape(-1, _COLUMNS)
     return _measurement(str(path), table, malformed, stated[0], options)
 
 

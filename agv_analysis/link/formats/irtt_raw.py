@@ -26,6 +26,8 @@ from agv_analysis.link.measurement import (
 )
 
 _COLUMNS = 7
+_WANTED = (0, 1, 2, 3, 5)
+"""Number, delays, duplicate."""
 _USUAL_INTERVAL = 1.0
 """Time between packets that irtt takes without -i [s]."""
 
@@ -40,9 +42,9 @@ def _matches(head: bytes, path: Path) -> bool:
 
 def _read(path: Path, options: Options) -> Measurement:
     malformed = Malformed()
-    table = rows_of_words(path, _COLUMNS, malformed, options.progress)
+    table = rows_of_words(path, _COLUMNS, malformed, options.progress, _WANTED)
     needs_packets(len(table), str(path), "line of a reply")
-    again = table[:, 5] == 1.0
+    again = table[:, 4] == 1.0
     table, duplicates = table[~again], int(np.count_nonzero(again))
     needs_packets(len(table), str(path), "reply that is no duplicate")
     seq = table[:, 0].astype(np.int64)

@@ -38,10 +38,10 @@ _USUAL_INTERVAL = 1.0
 
 _HEADER = re.compile(rb"PING\s")
 _SUMMARY = re.compile(rb"(\d+) packets transmitted(?:.*?\btime (\d+) ?ms)?")
-_REPLY = re.compile(rb"bytes from .*?(?:icmp_)?seq[=:]\d+|no answer yet for icmp_seq=\d+")
+_REPLY = re.compile(rb": (?:icmp_)?seq=\d+ ttl=\d+|no answer yet for icmp_seq=\d+")
 _OTHER = re.compile(
     rb"-+ .* ping statistics -+|(rtt|round-trip) .*|\^C|\d+ packets transmitted.*|pipe \d+|ping: .*|WARNING: .*"
-    rb"|.*\+\d+ (duplicates|errors|corrupted).*|PATTERN: .*"
+    rb"|Request timeout for icmp_seq \d+|\d+/\d+ packets,.*|.*\+\d+ (duplicates|errors|corrupted).*|PATTERN: .*"
 )
 """Lines that say nothing of a packet."""
 
@@ -83,10 +83,9 @@ def _read_block(block: Block, found: _Found) -> None:
     text = block.text
     signs = np.flatnonzero((text == ord("=")) | (text == ord("<")))
     at_seq = signs[is_preceded_by(text, signs, b"seq")]
-    at_time = signs[is_preceded_by(text, signs, b"time")]
     lines = len(block.starts)
     line_of_seq = block.line_of(at_seq)
-    rtt = _by_line(block, at_time + 1, lines) * 1e-3
+    rtt = _milliseconds(block, signs[~is_preceded_by(text, signs, b"ttl")] + 1, lines)
     first = _after_stamp(block)
     stamped = text[block.starts] == ord("[")
     stamp = np.full(lines, np.nan)
@@ -111,10 +110,19 @@ def _read_block(block: Block, found: _Found) -> None:
         _read_other(block, i, found)
 
 
-def _by_line(block: Block, places: Places, lines: int) -> Floats:
-    """The numbers at these places, by line, NaN on lines that have none."""
+def _milliseconds(block: Block, places: Places, lines: int) -> Floats:
+    """The numbers at these places that ` ms` follows, by line [s], NaN on lines that have none.
+
+    Whatever is before them: ping speaks the user's language.
+    """
+    text, last = block.text, len(block.text) - 1
+    numbers = numbers_at(text, places)
+    ends = places + numbers.length
+    is_time = numbers.length > 0
+    for i, letter in enumerate(b" ms"):
+        is_time &= text[np.minimum(ends + i, last)] == letter
     values = np.full(lines, np.nan)
-    values[block.line_of(places)] = numbers_at(block.text, places).values
+    values[block.line_of(places[is_time])] = 1e-3 * numbers.values[is_time]
     return values
 
 
@@ -148,12 +156,13 @@ def _measurement(source: str, found: _Found, options: Options) -> Measurement:
     seq, is_reply = unwrapped(np.concatenate(found.seq)), np.concatenate(found.is_reply)
     rtt, stamp = joined(found.rtt), joined(found.stamp)
     first, last, notes = _range(seq, found)
+    for parts in (found.seq, found.is_reply, found.rtt, found.stamp):
+        parts.clear()  # of a long file they are as much again
     interval, said = _interval(found, options)
-    replies = seq[is_reply]
-    sent = stamp[is_reply] - np.nan_to_num(rtt[is_reply])
-    has_times = not np.isnan(sent).all() and len(replies) > 1
-    # Only what arrived out of order counts as such: replies and the order in which they came.
-    grid = on_grid(Numbered(replies, (rtt[is_reply],), sent if has_times else None), first, last, interval)
+    seq, rtt, sent = seq[is_reply], rtt[is_reply], stamp[is_reply]
+    sent -= np.nan_to_num(rtt)
+    has_times = not np.isnan(sent).all() and len(seq) > 1
+    grid = on_grid(Numbered(seq, (rtt,), sent if has_times else None), first, last, interval)
     if not has_times:
         notes = (*notes, said)
     return Measurement(

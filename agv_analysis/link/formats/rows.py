@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +11,6 @@ import numpy as np
 from agv_analysis.link.formats.text_columns import Block, Bytes, Places, Progress, blocks, cells, numbers_at
 from agv_analysis.link.measurement import Malformed
 from agv_analysis.run import Floats
-
-_BLANKS = np.frombuffer(b" \t\r\n", dtype=np.uint8)
 
 
 class Words(NamedTuple):
@@ -27,14 +25,14 @@ class Words(NamedTuple):
 
 def words_of(block: Block, count: int) -> Words:
     """Lines with `count` words between blanks; an empty block has none."""
-    blank = np.isin(block.text, _BLANKS)
+    blank = block.text <= ord(" ")  # blanks and ends of lines
     edges = np.diff(np.concatenate(([True], blank)).astype(np.int8))
     begins = np.flatnonzero(edges == -1)
     ends = np.flatnonzero(np.diff(np.concatenate((blank, [True])).astype(np.int8)) == 1) + 1
     of_line = block.line_of(begins)
-    found = np.flatnonzero(np.bincount(of_line, minlength=len(block.starts)) == count)
-    kept = np.isin(of_line, found)
-    return Words(found, begins[kept].reshape(-1, count), ends[kept].reshape(-1, count))
+    is_whole = np.bincount(of_line, minlength=len(block.starts)) == count
+    kept = is_whole[of_line]
+    return Words(np.flatnonzero(is_whole), begins[kept].reshape(-1, count), ends[kept].reshape(-1, count))
 
 
 def floats_at(text: Bytes, begins: Places, ends: Places) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
@@ -63,23 +61,28 @@ def lines_of_words(
     """Block by block the lines with `count` words; others that are not empty are malformed."""
     for block in blocks(path, progress):
         words = words_of(block, count)
-        for i in np.setdiff1d(np.arange(len(block.starts)), words.lines).tolist():
+        is_other = np.ones(len(block.starts), dtype=np.bool_)
+        is_other[words.lines] = False
+        for i in np.flatnonzero(is_other).tolist():
             line = block.line(i)
             if line.strip():
                 malformed.add(block.number + i, line)
         yield block, words
 
 
-def rows_of_words(path: Path, count: int, malformed: Malformed, progress: Progress | None = None) -> Floats:
-    """A file of numbers between blanks as a table, shape (n, count)."""
+def rows_of_words(
+    path: Path, count: int, malformed: Malformed, progress: Progress | None = None, wanted: Sequence[int] | None = None
+) -> Floats:
+    """The `wanted` columns of a file of `count` numbers a line between blanks, all by default: shape (n, wanted)."""
+    columns = range(count) if wanted is None else wanted
     parts = []
     for block, words in lines_of_words(path, count, malformed, progress):
-        table = np.empty((len(words.lines), count))
+        table = np.empty((len(words.lines), len(columns)))
         good = np.ones(len(table), dtype=np.bool_)
-        for column in range(count):
-            table[:, column], fine = floats_at(block.text, words.begins[:, column], words.ends[:, column])
+        for place, column in enumerate(columns):
+            table[:, place], fine = floats_at(block.text, words.begins[:, column], words.ends[:, column])
             good &= fine
         for i in np.flatnonzero(~good).tolist():
             malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
         parts.append(table[good])
-    return np.concatenate(parts) if parts else np.zeros((0, count))
+    return np.concatenate(parts) if parts else np.zeros((0, len(columns)))

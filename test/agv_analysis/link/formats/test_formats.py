@@ -95,6 +95,19 @@ def irtt_raw(path: Path) -> Path:
     return path
 
 
+def irtt_text(path: Path) -> Path:
+    lines = ["[Connecting] connecting to 10.0.0.2", "[Connected] connected to 10.0.0.2:2112"]
+    for i in range(N):
+        if i not in LOST:
+            rtt, rd, sd = f"{1e3 * RTT[i]:.4f}ms", f"{1e6 * DOWN[i]:.1f}µs", f"{UP[i]:.7f}s"
+            lines.append(f"seq={i} rtt={rtt} rd={rd} sd={sd} ipdv=n/a" + (" (LATE)" if i == 12 else ""))
+        if i == 20:
+            lines.append(f"DUP! seq={i}")
+    lines += ["", "                         Min     Mean   Median", "                duration: 4s (wait 3s)"]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def owping(path: Path) -> Path:
     """Seconds since 1900 as whole numbers of 2^-32 s; lost packets come last, with no time of arrival."""
 
@@ -275,6 +288,25 @@ def test_irtt_raw(tmp_path: Path) -> None:
     assert figures["uplink"]["delay"]["max_s"] == pytest.approx(max(UP))
 
 
+def test_irtt_text(tmp_path: Path) -> None:
+    found = measured(irtt_text(tmp_path / "irtt.txt"), Options(interval=INTERVAL))
+    assert (found.duplicates, found.reordered) == (1, 0)
+    check(found, LOST, RTT)
+    assert found.uplink is not None
+    assert found.uplink.delay is not None
+    assert np.nanmax(found.uplink.delay) == pytest.approx(max(UP))
+
+
+def test_ping_in_another_language(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    path.write_text("PING x (1.2.3.4) 56(84) Bytes an Daten.\n64 Bytes von 1.2.3.4: icmp_seq=1 ttl=64 Zeit=1.5 ms\n"
+                    "64 Bytes von 1.2.3.4: icmp_seq=3 ttl=64 Zeit=2 ms\n")  # fmt: skip
+    found = measured(path)
+    assert found.whole.lost.tolist() == [False, True, False]
+    assert found.whole.delay is not None
+    assert found.whole.delay[[0, 2]] == pytest.approx([0.0015, 0.002])
+
+
 def test_owping(tmp_path: Path) -> None:
     found = measured(owping(tmp_path / "ow.txt"))
     check(found, LOST_UP, UP, "uplink")
@@ -348,6 +380,7 @@ def test_iperf3_is_a_loss_rate_and_no_trace(tmp_path: Path) -> None:
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
+    "irtt-text": irtt_text,
     "ping": ping, "irtt": irtt, "irtt-raw": irtt_raw, "owping": owping, "table": lambda path: tables(path.parent)[0][0],
 }  # fmt: skip
 

@@ -1,0 +1,108 @@
+"""What irtt client prints without -q: a line a reply.
+
+    seq=3 rtt=1.2ms rd=601.5µs sd=603µs ipdv=10.1µs (LATE)
+    DUP! seq=3
+
+Delays have the units of Go's durations; `rd` and `sd` are there if the server has stamps. A number without a line was
+lost, on which way is not known. Source: the client of irtt.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from agv_analysis.link.formats.format import Format, Options
+from agv_analysis.link.formats.text_columns import Block, Bytes, Places, blocks, is_preceded_by, numbers_at
+from agv_analysis.link.measurement import (
+    RECEIVED,
+    UNKNOWN,
+    Malformed,
+    Measurement,
+    Numbered,
+    PacketOutcomes,
+    needs_packets,
+    on_grid,
+)
+from agv_analysis.run import Floats
+
+_LINE = re.compile(rb"^seq=\d+ rtt=-?[\d.]+", re.MULTILINE)
+_OTHER = re.compile(rb"\[\w+\] .*|DUP! seq=\d+|\s.*|.*(stats|rate|loss|duration|pkts|sent/received|Min|---|RTT).*")
+"""Lines that say nothing of a reply: events, duplicates, and the table at the end, which is set to the right."""
+
+_USUAL_INTERVAL = 1.0
+"""Time between packets that irtt takes without -i [s]."""
+
+_NAMES = (b"rtt", b"sd", b"rd")
+
+
+def _matches(head: bytes, path: Path) -> bool:
+    return _LINE.search(head) is not None
+
+
+def _read(path: Path, options: Options) -> Measurement:
+    malformed, parts, duplicates = Malformed(), list[Floats](), 0
+    for block in blocks(path, options.progress):
+        table, again = _table(block, malformed)
+        parts.append(table)
+        duplicates += again
+    found = np.concatenate(parts) if parts else np.zeros((0, 4))
+    needs_packets(len(found), str(path), "line of a reply")
+    seq = found[:, 0].astype(np.int64)
+    interval = options.interval or _USUAL_INTERVAL
+    assumed = "as --interval says" if options.interval else "irtt's usual, is assumed; say otherwise with --interval"
+    notes = (
+        f"the lines do not say when packets were sent: {interval:g} s between them, {assumed}",
+        "packets after the last reply are unknown, and on which way a packet was lost",
+    )
+    grid = on_grid(Numbered(seq, tuple(found[:, i] for i in (1, 2, 3))), 0, int(seq.max()), interval)
+    rtt, up, down = grid.delays
+    either = np.where(grid.outcome == RECEIVED, RECEIVED, UNKNOWN).astype(np.int8)
+    directions = [PacketOutcomes(either, None if np.isnan(delay).all() else delay) for delay in (up, down)]
+    return Measurement(
+        source=str(path), format="irtt", sent=grid.sent, uplink=directions[0], downlink=directions[1],
+        round_trip=PacketOutcomes(grid.outcome, rtt), duplicates=duplicates + grid.duplicates,
+        reordered=grid.reordered, malformed=malformed, notes=notes,
+    )  # fmt: skip
+
+
+def _table(block: Block, malformed: Malformed) -> tuple[Floats, int]:
+    """Number and delays rtt, sd, rd [s] of each reply of a block, shape (n, 4); how many lines are of duplicates."""
+    text, lines = block.text, len(block.starts)
+    signs = np.flatnonzero(text == ord("="))
+    at_seq = signs[is_preceded_by(text, signs, b"seq")]
+    of_line = block.line_of(at_seq)
+    begins = at_seq == block.starts[of_line] + 3  # at the beginning of its line, which a duplicate's is not
+    table = np.full((lines, 4), np.nan)
+    table[of_line[begins], 0] = numbers_at(text, at_seq[begins] + 1).values
+    for column, name in enumerate(_NAMES, start=1):
+        at = signs[is_preceded_by(text, signs, b" " + name)]
+        table[block.line_of(at), column] = _durations(text, at + 1)
+    whole = ~np.isnan(table[:, 0]) & ~np.isnan(table[:, 1])
+    duplicates = 0
+    for i in np.flatnonzero(~whole).tolist():
+        line = block.line(i)
+        duplicates += line.startswith(b"DUP!")
+        if line.strip() and not _OTHER.fullmatch(line):
+            malformed.add(block.number + i, line)
+    return table[whole], duplicates
+
+
+def _durations(text: Bytes, places: Places) -> Floats:
+    """Durations of Go with one unit [s], NaN for others."""
+    negative = text[places] == ord("-")
+    numbers = numbers_at(text, places + negative)
+    unit = np.minimum(places + negative + numbers.length, len(text) - 1)
+    first, second = text[unit], text[np.minimum(unit + 1, len(text) - 1)]
+    scale = np.full(len(places), np.nan)
+    scale[(first == ord("s"))] = 1.0
+    scale[(first == ord("m")) & (second == ord("s"))] = 1e-3
+    scale[(first == ord("u")) | (first == 0xC2)] = 1e-6  # the sign for micro has two bytes
+    scale[first == ord("n")] = 1e-9
+    values = numbers.values * scale
+    return np.asarray(np.where(negative, -values, values))
+
+
+FORMAT = Format("irtt-text", "output of irtt client", 35, _matches, _read)
