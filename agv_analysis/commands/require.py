@@ -35,12 +35,13 @@ if TYPE_CHECKING:
 @click.option("--transfer-interval", type=click.FloatRange(min=0.0, min_open=True), help="Offered with it [s].")
 @click.option("--latency", type=click.FloatRange(min=0.0), default=0.0, help="Offered with it [s].")
 @click.option("--table", type=click.Path(path_type=Path), help="Write tables in Markdown to this file.")
+@click.option("--report", type=click.Path(path_type=Path), help="Write a page for the browser to this file.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
 def command(
     params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
     interval: float | None, name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
     survival_time: float | None, transfer_interval: float | None, latency: float, table: Path | None,
-    json_file: Path | None,
+    report: Path | None, json_file: Path | None,
 ) -> None:  # fmt: skip
     """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
 
@@ -96,17 +97,24 @@ def command(
     if survival_time is not None:
         offered = _on_service(scenario, survival_time, latency, transfer_interval)
         sections["On the offered service"], content["offered"] = offered
-    sections["Classes of service"] = list(rows_of_classes(classes, enough, met))
+    sections[_CLASSES] = list(rows_of_classes(classes, enough, met))
     _print(console, params, sections, loop)
     if table is not None:
-        heads = dict.fromkeys(sections, ("", "")) | {"Classes of service": _HEAD}
-        _write(table, markdown(sections, heads))
+        _write(table, markdown(sections, _HEADS))
         console.print(f"table:   {table}")
+    if report is not None:
+        from agv_analysis.report.requirements_page import write_requirements
+
+        write_requirements(report, scenario, loop, sections, _HEADS, content)
+        console.print(f"report:  {report}")
     if json_file is not None:
         write_json(json_file, content)
 
 
+_CLASSES = "Classes of service"
 _HEAD = ("class", "source", "would it do for the loop?", "does the link meet it?")
+_HEADS: dict[str, tuple[str, ...]] = {_CLASSES: _HEAD}
+"""Heads of the tables that have one."""
 
 
 def _asked(availability: float | None, mtbf: float | None) -> ServiceClass:

@@ -115,10 +115,10 @@ def rows_of_classes(
 
 
 def markdown(sections: Mapping[str, Sequence[Sequence[str]]], heads: Mapping[str, Sequence[str]]) -> str:
-    """Sections of rows as tables in Markdown."""
+    """Sections of rows as tables in Markdown, with the `heads` of those that have one."""
     text = ""
     for title, rows in sections.items():
-        head = heads[title]
+        head = heads.get(title, ("",) * len(rows[0]))
         lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
         lines += ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
         text += f"## {title}\n\n" + "\n".join(lines) + "\n\n"
@@ -126,4 +126,4 @@ def markdown(sections: Mapping[str, Sequence[Sequence[str]]], heads: Mapping[str
 
 
 def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.4g} ms"
+    return f"{1e3 * seconds:.4g} ms" if seconds < 10.0 else f"{seconds:.4g} s"

@@ -204,10 +204,11 @@ def test_what_would_do() -> None:
 
 
 def test_what_the_command_says(tmp_path: Path, agv_ncs: AgvNcs) -> None:
-    table, found = tmp_path / "table.md", tmp_path / "found.json"
+    table, found, page = tmp_path / "table.md", tmp_path / "found.json", tmp_path / "page.html"
     status, said = agv_ncs(
         "require", "config/outages.yaml", "--set", "error_detector.track=line", "--set", "relay.uplink.model=bernoulli",
         "--set", "relay.uplink.p=0.5", "--mtbf", "10000", "--survival-time", "0.02", "--table", table, "--json", found,
+        "--report", page,
     )  # fmt: skip
     assert status == 0, said
     content = json.loads(found.read_text())
@@ -220,3 +221,6 @@ def test_what_the_command_says(tmp_path: Path, agv_ncs: AgvNcs) -> None:
     assert content["offered"]["holds"] is True
     assert "70 ms (14 slots)" in said
     assert "| Survival time, by stability | 70 ms (14 slots) |" in table.read_text()
+    html = page.read_text()
+    assert "Every 5 ms a message; outages of 70 ms at most, or a latency of 60.29 ms" in html
+    assert 'id="plot-bursts"' in html
