@@ -57,7 +57,7 @@ def command(
     from agv_analysis.link.netem import to_netem
     from agv_analysis.scenario import load_scenario
     from agv_analysis.simulation.reference import reference_of
-    from agv_plant.channels.trace import load_trace
+    from agv_plant.channels.timed_trace import read_trace
     from agv_ros.errors import UserError
 
     scenario = load_scenario(params, settings)
@@ -66,9 +66,7 @@ def command(
     if fit is not None and from_netem is not None:
         raise UserError("--fit and --from-netem both name a channel: give one of them")
     if fit is not None:
-        import numpy as np
-
-        channel = fitted(np.array(load_trace(fit)), channel)
+        channel = fitted(read_trace(fit, link).lost, channel)
     if from_netem is not None:
         channel = channel_of(from_netem, channel)
     if netem:

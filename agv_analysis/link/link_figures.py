@@ -11,6 +11,7 @@ import numpy as np
 
 from agv_analysis.link.change_points import Stationarity, stationarity
 from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
+from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.link.measurement import LossRates, Measurement, PacketOutcomes, Setting
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.resampling import weights
@@ -273,13 +274,17 @@ def rates_to_json(found: LossRates) -> dict[str, Any]:
 def setting_to_json(found: Setting) -> dict[str, Any]:
     """What an emulator was set to, as a channel; nothing was measured."""
     changed = ("model", "p", "r", "h", "k", "delay", "jitter", "duplicate")
-    values = as_dict(found.channel)
+    values, chain = as_dict(found.channel), chain_of(found.channel)
+    rate = None if chain is None else {"value": chain.loss_rate, "low": chain.loss_rate, "high": chain.loss_rate}
     return {
         "source": found.source,
         "format": found.format,
         "packets": None,
         "span_s": None,
         "interval_s": None,
+        UPLINK: {**_untold(), "loss_rate": rate},
+        DOWNLINK: _untold(),
+        ROUND_TRIP: _untold(),
         "channel": {name: values[name] for name in changed},
         "exact": not found.differences,
         "differences": list(found.differences),

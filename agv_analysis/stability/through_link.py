@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import simulate_batch
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.stability.confidence.link_confidence import link_confidence
-from agv_analysis.stability.empirical import with_an_end
+from agv_analysis.stability.empirical import with_an_end, with_windows
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.evidence import evidence_of_scenario
 from agv_analysis.stability.scenario_loop import lap_of, loop_on_lap
@@ -134,7 +133,7 @@ def through_trace(scenario: Scenario, link: LinkOfLoop, file: Path) -> ThroughLi
             evidence, link=seen, growth=seen.growth, probability_stable=seen.probability_stable,
             n=max(longest, evidence.n),
         )  # fmt: skip
-    spread = with_windows(found, seconds)
+    spread = with_windows(found)
     return ThroughLink(
         decide(evidence), evidence.confidence, deviations_of(spread, windows), seconds, longest
     )  # fmt: skip
@@ -155,17 +154,6 @@ def through_channel(scenario: Scenario, seeds: int = _WINDOWS) -> ThroughLink:
 def with_duration(scenario: Scenario, seconds: float) -> Scenario:
     """A scenario of another length."""
     return replace(scenario, plant=replace(scenario.plant, duration=seconds))
-
-
-def with_windows(scenario: Scenario, seconds: float) -> Scenario:
-    """A scenario whose seeds are windows of its traces."""
-    relay = scenario.relay
-    links = {
-        name: replace(getattr(relay, name), trace_window=seconds)
-        for name in ("uplink", "downlink")
-        if getattr(relay, name).model == "trace"
-    }
-    return replace(scenario, relay=dataclasses.replace(relay, **links))
 
 
 def deviations_of(scenario: Scenario, runs: int) -> Floats:

@@ -12,6 +12,7 @@ from agv_analysis.metrics.outages import outage_lengths
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
+from agv_analysis.stability.empirical import simulated_twins
 from agv_plant.channels.trace import TraceError
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import Channel, losses
@@ -90,6 +91,19 @@ def test_seeds_are_windows_of_a_long_trace(tmp_path: Path) -> None:
     rows.write_text("lost\n" + "0\n1\n1\n0\n")
     c = channel(rows, trace_window=2 * INTERVAL)
     assert losses(c, 2, "uplink", 5, INTERVAL).tolist() == [False, False, False, True, True]
+
+
+def test_twins_meet_different_parts_of_a_long_trace(tmp_path: Path) -> None:
+    path = measured(tmp_path / "t.csv")
+    settings = ("relay.uplink.model=trace", f"relay.uplink.trace_file={path}", "error_detector.track=line")
+    runs = {
+        seconds: simulated_twins(
+            load_scenario(REPOSITORY / "config/paper.yaml", (*settings, f"plant.duration={seconds}")), range(1, 5)
+        )
+        for seconds in (1.0, 3.0)
+    }
+    assert runs[1.0].different == 4
+    assert runs[3.0].different == 1  # the trace lasts 4 s
 
 
 def test_each_direction_has_its_own_columns(tmp_path: Path) -> None:
