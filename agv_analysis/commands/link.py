@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import write_json
+from agv_analysis.commands import corridor_settings, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,6 +27,7 @@ _LONG = 2**25
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("params", type=click.Path(), required=False)
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter of PARAMS.")
+@click.option("--corridor", type=click.FloatRange(min=0.0, min_open=True), help="How often is it further off [m]?")
 @click.option("--format", "name", help="The format of FILE, if it cannot be told by what is in it.")
 @click.option("--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between packets [s], if unsaid.")
 @click.option("--column", "columns", multiple=True, metavar="ROLE=NAME", help="Which column of a table is what.")
@@ -40,9 +41,9 @@ _LONG = 2**25
 @click.option("--picture", type=click.Path(path_type=Path), help="Draw the link to this file.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
 def command(
-    file: Path, params: str | None, settings: tuple[str, ...], name: str | None, interval: float | None,
-    columns: tuple[str, ...], topic: str, received: Path | None, rtt: str, trace: Path | None, picture: Path | None,
-    json_file: Path | None,
+    file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, name: str | None,
+    interval: float | None, columns: tuple[str, ...], topic: str, received: Path | None, rtt: str, trace: Path | None,
+    picture: Path | None, json_file: Path | None,
 ) -> None:  # fmt: skip
     """Show what FILE says of a link: output of ping, irtt, owping, iperf3, a capture, a table, a bag, a line for netem.
 
@@ -61,7 +62,7 @@ def command(
     from agv_analysis.link.measurement import LossRates, Setting
     from agv_analysis.scenario import load_scenario
 
-    scenario = None if params is None else load_scenario(params, settings)
+    scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
     options = Options(interval, dict(map(_column, columns)), topic, received)
     reading = _read(file, options, name or "")
     console = Console(highlight=False)
@@ -218,6 +219,13 @@ def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
     far = f"up to {largest:.3g} m from its reference" if np.isfinite(largest) else "without bound"
     median = "" if count == 1 else f", the median run up to {float(np.median(driven.deviations)):.3g} m"
     console.print(f"  Deviation in {runs}: {far}{median}", soft_wrap=True)
+    if driven.corridor:
+        leaves = driven.leaves
+        console.print(
+            f"  Further off than {driven.corridor:g} m: {driven.left} of {count} runs (95 %: {leaves.low:.3g} to "
+            f"{leaves.high:.3g} of them)",
+            soft_wrap=True,
+        )
 
 
 def rows(found: LinkFigures) -> Iterator[tuple[str, ...]]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.link.channel_fit import ChannelFit
+from agv_analysis.link.channel_fit import ChannelFit, Estimate
 from agv_analysis.link.measured_trace import LinkOfLoop, write_trace
 from agv_analysis.metrics.outages import outage_lengths
 from agv_analysis.run import Floats
@@ -47,6 +47,18 @@ class ThroughLink:
     """Length of a run [s]."""
     longest_slots: int
     """The longest uplink outage [slots]."""
+    corridor: float = 0.0
+    """Half-width of the corridor about the reference [m]; 0: there is none."""
+
+    @property
+    def left(self) -> int:
+        """Runs that left the corridor."""
+        return int(np.count_nonzero(self.deviations > self.corridor)) if self.corridor else 0
+
+    @property
+    def leaves(self) -> Estimate:
+        """Probability to leave the corridor in such a run, with its 95 % interval."""
+        return Estimate.of(self.left, len(self.deviations))
 
     def to_json(self) -> dict[str, Any]:
         """`verdict`, `verdict_reason`, `confidence`, `deviation_max_m`, `deviation_median_m`, and of which runs."""
@@ -59,6 +71,17 @@ class ThroughLink:
             "runs": len(self.deviations),
             "run_s": self.seconds,
             "outage_max_slots": self.longest_slots,
+            "corridor": self._corridor_to_json(),
+        }
+
+    def _corridor_to_json(self) -> dict[str, Any] | None:
+        if not self.corridor:
+            return None
+        leaves = self.leaves
+        return {
+            "half_width_m": self.corridor,
+            "left": self.left,
+            "p_run": {"value": leaves.value, "low": leaves.low, "high": leaves.high},
         }
 
 
@@ -134,9 +157,9 @@ def through_trace(scenario: Scenario, link: LinkOfLoop, file: Path) -> ThroughLi
             n=max(longest, evidence.n),
         )  # fmt: skip
     spread = with_windows(found)
-    return ThroughLink(
-        decide(evidence), evidence.confidence, deviations_of(spread, windows), seconds, longest
-    )  # fmt: skip
+    corridor = scenario.error_detector.corridor
+    deviations = deviations_of(spread, windows)
+    return ThroughLink(decide(evidence), evidence.confidence, deviations, seconds, longest, corridor)
 
 
 def through_channel(scenario: Scenario, seeds: int = _WINDOWS) -> ThroughLink:
@@ -146,9 +169,9 @@ def through_channel(scenario: Scenario, seeds: int = _WINDOWS) -> ThroughLink:
     steps = round(ended.plant.duration / ended.plant.ts)
     lost = ChannelRealisation(ended.relay.seed, steps, ended.plant.ts).outcomes(ended.relay.uplink, "uplink")
     longest = int(outage_lengths(np.arange(steps), lost).max(initial=0))
-    return ThroughLink(
-        decide(evidence), evidence.confidence, deviations_of(ended, seeds), ended.plant.duration, longest
-    )  # fmt: skip
+    corridor = scenario.error_detector.corridor
+    deviations = deviations_of(ended, seeds)
+    return ThroughLink(decide(evidence), evidence.confidence, deviations, ended.plant.duration, longest, corridor)
 
 
 def with_duration(scenario: Scenario, seconds: float) -> Scenario:

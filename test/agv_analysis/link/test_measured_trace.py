@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -120,6 +121,8 @@ def test_a_loop_through_a_measured_link_is_judged_by_outages_as_long_as_they_wer
     # One outage leaves a v T_s n (n + 1) / 2 along a line, and a share of the one before.
     one = 0.125 * 0.005 * 12 * 13 / 2
     assert one <= found.deviations.max() < 1.5 * one
+    inside, outside = (dataclasses.replace(found, corridor=share * one) for share in (1.5, 0.9))
+    assert (inside.left, outside.left) == (0, len(found.deviations))
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
