@@ -23,20 +23,24 @@ from agv_analysis.link.age_chain import AgeChain
 from agv_analysis.run import Floats
 from agv_analysis.stability import floquet
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.mean_square import settled_growth
+from agv_analysis.stability.mean_square import growth_over_lap
 
 MOST_WORK = 2e9
-"""Numbers to be moved over a lap beyond which there is no answer: about a minute."""
+"""Numbers to be moved over a lap beyond which there is no answer: about ten seconds."""
+
+_STEPS_OF_CONSTANT = 1500
+"""Steps, about, that are driven of a loop that is the same at every step."""
 
 
 def work(loop: LinearLoop, ages: AgeChain) -> float:
     """Numbers that are moved over a lap, or over the steps that stand for one where the loop is constant."""
     size = loop.size + loop.outputs * (ages.oldest + 1)
-    return float(np.count_nonzero(ages.moves)) * size**2 * (2000 if loop.is_constant else loop.steps)
+    steps = _STEPS_OF_CONSTANT if loop.is_constant else loop.steps
+    return float(np.count_nonzero(ages.moves)) * size**2 * steps
 
 
 def lap_growth(loop: LinearLoop, ages: AgeChain) -> float:
-    """Growth (logarithm) of the second moments over a lap, by driving laps until it settles.
+    """Growth (logarithm) of the second moments over a lap, by Arnoldi's method.
 
     Raises ValueError for a loop that predicts unless its model is exact: there a late pose is as good as a fresh one.
     """
@@ -44,18 +48,19 @@ def lap_growth(loop: LinearLoop, ages: AgeChain) -> float:
         raise ValueError("late and lost poses are judged where they are held, not where they are predicted")
     if loop.is_exact or ages.is_constant:
         return 2.0 * floquet.constant_delay(loop, ages.oldest)
-    q, size = loop.outputs, loop.size + loop.outputs * (ages.oldest + 1)
+    size = loop.size + loop.outputs * (ages.oldest + 1)
     moments = np.array(np.broadcast_to(np.eye(size), (len(ages.moves), size, size)))
-    return settled_growth(
-        loop, (moments,), lambda: float(np.trace(moments, axis1=1, axis2=2).sum()),
-        lambda steps: float(compiled(_drive_lap)(loop.F, loop.G, ages.moves, steps, q, moments)),
+    return growth_over_lap(
+        loop, (moments,),
+        lambda steps: float(compiled(_drive_lap)(loop.F, loop.G, ages.moves, steps, moments)),
     )  # fmt: skip
 
 
-def _drive_lap(F: Floats, G: Floats, moves: Floats, steps: int, q: int, moments: Floats) -> float:
+def _drive_lap(F: Floats, G: Floats, moves: Floats, steps: int, moments: Floats) -> float:
     """Send the moments, shape (s, n, n), through so many steps; in place, to be multiplied by exp(return value)."""
-    modes, size, m = moments.shape[0], moments.shape[1], F.shape[1]
-    after, half, moved = np.zeros_like(moments), np.zeros((size, size)), np.zeros((size, size))
+    modes, size, m, q = moments.shape[0], moments.shape[1], G.shape[1], G.shape[2]
+    arrivals = moves.shape[1]
+    after, moved = np.zeros_like(moments), np.zeros((m, size))
     source, log_scale = np.zeros(size, dtype=np.int64), 0.0
     for i in range(size):  # of the window: each error becomes one step older
         source[i] = i - m if i < m + q else i - q
@@ -63,43 +68,58 @@ def _drive_lap(F: Floats, G: Floats, moves: Floats, steps: int, q: int, moments:
         row = k % F.shape[0]
         after[:] = 0.0
         for s in range(modes):
-            for arrival in range(moves.shape[1]):
+            for arrival in range(arrivals):
                 if moves[s, arrival].sum() == 0.0:
                     continue
-                answered = size - q if arrival == moves.shape[1] - 1 else 0 if arrival == 0 else m + (arrival - 1) * q
+                answered = size - q if arrival == arrivals - 1 else 0 if arrival == 0 else m + (arrival - 1) * q
                 for i in range(q):
                     source[size - q + i] = answered + i
-                _move_rows(F[row], G[row], answered, source, moments[s], half)
-                _move_rows(F[row], G[row], answered, source, half.T, moved)
+                _move_state(F[row], G[row], answered, moments[s], moved)
                 for t in range(modes):
-                    weight = moves[s, arrival, t]
-                    if weight > 0.0:
-                        after[t] += weight * moved
+                    if moves[s, arrival, t] > 0.0:
+                        _add_moved(F[row], G[row], answered, source, moments[s], moved, moves[s, arrival, t], after[t])
         largest = 0.0
         for t in range(modes):
             for i in range(size):
-                for j in range(i + 1):  # rounding must not make a skew part
-                    mean = 0.5 * (after[t, i, j] + after[t, j, i])
-                    moments[t, i, j] = mean
-                    moments[t, j, i] = mean
-                largest = max(largest, moments[t, i, i])
+                for j in range(i + 1):
+                    moments[t, i, j] = after[t, i, j]
+                    moments[t, j, i] = after[t, i, j]
+                    largest = max(largest, abs(after[t, i, j]))
         if largest > 1e100 or 0.0 < largest < 1e-100:
             moments /= largest
             log_scale += math.log(largest)
     return log_scale
 
 
-def _move_rows(F: Floats, G: Floats, answered: int, source: NDArray[np.int64], X: Floats, moved: Floats) -> None:
-    """`moved` = A X for one arrival: the errors at `answered` are acted on, the rows of the window are copies."""
-    m, q = G.shape
-    for i in range(m):
+def _move_state(F: Floats, G: Floats, answered: int, X: Floats, moved: Floats) -> None:
+    """`moved` = the rows of A X that are z, shape (m, n), for one arrival: the errors at `answered` are acted on."""
+    for i in range(moved.shape[0]):
         for j in range(X.shape[1]):
+            moved[i, j] = 0.0
+        for p in range(F.shape[1]):
+            for j in range(X.shape[1]):
+                moved[i, j] += F[i, p] * X[p, j]
+        for p in range(G.shape[1]):
+            for j in range(X.shape[1]):
+                moved[i, j] += G[i, p] * X[answered + p, j]
+
+
+def _add_moved(
+    F: Floats, G: Floats, answered: int, source: NDArray[np.int64], X: Floats, moved: Floats, weight: float,
+    total: Floats,
+) -> None:  # fmt: skip
+    """`total` += weight A X A', its lower half; all rows of A but those of z, which are in `moved`, are copies."""
+    m = moved.shape[0]
+    for i in range(m):
+        for j in range(i + 1):
             value = 0.0
             for p in range(m):
-                value += F[i, p] * X[p, j]
-            for p in range(q):
-                value += G[i, p] * X[answered + p, j]
-            moved[i, j] = value
+                value += moved[i, p] * F[j, p]
+            for p in range(G.shape[1]):
+                value += moved[i, answered + p] * G[j, p]
+            total[i, j] += weight * value
     for i in range(m, X.shape[0]):
-        for j in range(X.shape[1]):
-            moved[i, j] = X[source[i], j]
+        for j in range(m):
+            total[i, j] += weight * moved[j, source[i]]
+        for j in range(m, i + 1):
+            total[i, j] += weight * X[source[i], source[j]]

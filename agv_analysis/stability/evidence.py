@@ -15,10 +15,10 @@ from agv_analysis.link.markov_channel import Chain, chain_of, gilbert_elliott
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability import joint_spectral_radius, mean_square, mean_square_two_links
+from agv_analysis.stability import mean_square, mean_square_two_links
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.criteria import CRITERIA
-from agv_analysis.stability.criteria.any_outages import longest_for
+from agv_analysis.stability.criteria.any_outages import largest_n, longest_for
 from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
 from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
 from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
@@ -123,7 +123,7 @@ def _with_margin(evidence: Evidence, facts: RunFacts, judgements: Mapping[str, J
     if facts.loop.closed_form is None and not facts.loop.is_constant:  # half a minute for a number beside the word
         found = _with_longest(evidence, facts, judgements)
     else:
-        n_bursts, _ = joint_spectral_radius.largest_n(facts.loop, longest_for(facts.loop, facts.n))
+        n_bursts, _ = largest_n(facts.loop, longest_for(facts.loop, facts.n))
         found = replace(evidence, n_bursts=n_bursts)
     if evidence.link is None or decide(found).word != MEAN_SQUARE:
         return found

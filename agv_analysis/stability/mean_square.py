@@ -28,14 +28,13 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_
 from agv_analysis.run import Floats
 from agv_analysis.stability.first_border import borders
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
+from agv_analysis.stability.moment_growth import SETTLED, moment_growth
 from agv_analysis.stability.products import assign, divide, log_spectral_radius, multiply
-
-_LAPS = 40
 
 _LARGEST = 400
 """Size of the recursion's matrix up to which its eigenvalues are asked for instead of driving laps."""
 
-_STEPS = 2000
+_STEPS = 128
 """A loop that is the same at every step is driven so many at once, a shorter lap several times."""
 
 MOST_LOST = 0.9999
@@ -47,8 +46,8 @@ LONGEST_BURST = 1e6
 _TRIED = 25
 """Loss probabilities of the grid on which borders are searched for."""
 
-_SETTLED, _ROUGHLY = 1e-8, 1e-3
-"""Change of the growth from one lap to the next, relative where it is above 1, at which it counts as settled."""
+_ROUGHLY = 1e-3
+"""As `moment_growth.SETTLED`, where the sign alone is asked for."""
 
 _DOUBTFUL = 0.1
 """Growth over a lap below which a roughly settled one does not tell the sign."""
@@ -105,17 +104,12 @@ class Moments(NamedTuple):
             )
         )
 
-    def size(self) -> float:
-        """Sum of all mean squares."""
-        return float(sum(np.trace(part, axis1=1, axis2=2).sum() for part in (self.zz, self.hh)))
 
-
-def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, settled: float = _SETTLED) -> float:
+def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, settled: float = SETTLED) -> float:
     """Growth (logarithm) of the second moments over a lap.
 
-    By driving laps until the growth settles; `moments` are those to begin with, and are left as they settled, which
-    makes the next call with a similar chain faster. Without losses it is twice that of the state itself. `settled`: as
-    of `settled_growth`.
+    By Arnoldi's method; `moments` are those to begin with, and are left as they settled, which makes the next call with
+    a similar chain faster. Without losses it is twice that of the state itself. `settled`: as of `moment_growth`.
     """
     if loop.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
         chain, moments = bernoulli(0.0), None
@@ -127,7 +121,7 @@ def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, s
         return 2.0 * log_spectral_radius(received) * (loop.steps / len(received))
     if moments is None:
         moments = Moments.unit(loop, len(chain.delivery))
-    return settled_growth(loop, moments, moments.size, _drive(loop, chain, moments), settled)
+    return growth_over_lap(loop, moments, _drive(loop, chain, moments), settled)
 
 
 def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:
@@ -137,29 +131,15 @@ def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], 
     )
 
 
-def settled_growth(
-    loop: LinearLoop, moments: tuple[Floats, ...], size: Callable[[], float], drive: Callable[[int], float],
-    settled: float = _SETTLED,
-) -> float:  # fmt: skip
-    """Growth (logarithm) of second moments over a lap, by driving laps until it settles; -inf if nothing is left.
+def growth_over_lap(
+    loop: LinearLoop, moments: tuple[Floats, ...], drive: Callable[[int], float], settled: float = SETTLED
+) -> float:
+    """Growth (logarithm) of second moments over a lap; -inf if nothing is left.
 
-    `drive` sends them through so many steps in place, to be multiplied by exp(what it returns); `size` is theirs.
-    Settled is a growth that changes by less than `settled` from one lap to the next, relative where it is above 1.
+    `drive` sends them through so many steps in place, to be multiplied by exp(what it returns); see `moment_growth`.
     """
-    steps, growths = _STEPS if loop.is_constant else math.ceil(_STEPS / loop.steps) * loop.steps, [math.nan]
-    for _ in range(_LAPS):
-        log_scale, size_now = drive(steps), size()
-        if not size_now > 0.0:
-            for part in moments:  # a predictor leaves nothing of the error but rounding
-                part[:] = np.eye(*part.shape[1:])
-            return -math.inf
-        # From one lap to the next the moments keep their proportions in the end, so their size says it all.
-        for part in moments:
-            part /= size_now
-        growths.append(log_scale + math.log(size_now))
-        if abs(growths[-1] - growths[-2]) <= settled * max(1.0, abs(growths[-1])):
-            return growths[-1] * (loop.steps / steps)
-    return float(np.mean(growths[_LAPS // 2 :])) * (loop.steps / steps)  # without losses a complex pair never settles
+    steps = _STEPS if loop.is_constant else math.ceil(_STEPS / loop.steps) * loop.steps
+    return moment_growth(moments, lambda: drive(steps), steps, settled) * (loop.steps / steps)
 
 
 def _drive_lap(
@@ -232,9 +212,13 @@ def _drive_lap(
             _mix(T[:, j], g, received_zh, missed_zh, zh[j])
             _mix(T[:, j], g, received_hh, missed_hh, hh[j])
             for p in range(m):
-                largest = max(largest, zz[j, p, p])
+                for r in range(m):
+                    largest = max(largest, abs(zz[j, p, r]))
+                for r in range(q):
+                    largest = max(largest, abs(zh[j, p, r]))
             for p in range(q):
-                largest = max(largest, hh[j, p, p])
+                for r in range(q):
+                    largest = max(largest, abs(hh[j, p, r]))
         if largest > 1e100 or 0.0 < largest < 1e-100:
             for j in range(states):
                 divide(zz[j], largest)
@@ -289,7 +273,7 @@ def _sign_first(growth: Callable[[float, float], float]) -> Callable[[float], fl
     @functools.cache
     def found(x: float) -> float:
         rough = growth(x, _ROUGHLY)
-        return rough if abs(rough) > _DOUBTFUL else growth(x, _SETTLED)
+        return rough if abs(rough) > _DOUBTFUL else growth(x, SETTLED)
 
     return found
 

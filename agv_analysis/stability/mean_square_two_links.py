@@ -30,7 +30,7 @@ from agv_analysis.compiled import compiled
 from agv_analysis.link.joint_chain import OUTCOMES, JointChain
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.mean_square import settled_growth
+from agv_analysis.stability.mean_square import growth_over_lap
 from agv_analysis.stability.products import divide
 
 POLICIES = ("hold", "zero")
@@ -41,7 +41,7 @@ _LARGEST = 400
 
 
 def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> float:
-    """Growth (logarithm) of the second moments over a lap. Where the loop changes by driving laps until it settles.
+    """Growth (logarithm) of the second moments over a lap. Where the loop changes by Arnoldi's method.
 
     `stops`: the plant stops where a command is lost, instead of holding the one before.
     """
@@ -50,12 +50,7 @@ def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> floa
     if loop.is_constant and states * size**2 <= _LARGEST:
         return loop.steps * math.log(np.abs(np.linalg.eigvals(operator(maps[0], links))).max())
     moments = np.array(np.broadcast_to(np.eye(size), (states, size, size)), order="C")
-    return settled_growth(
-        loop,
-        (moments,),
-        lambda: float(np.trace(moments, axis1=1, axis2=2).sum()),
-        lambda steps: float(compiled(_drive_lap)(maps, *links, steps, moments)),
-    )
+    return growth_over_lap(loop, (moments,), lambda steps: float(compiled(_drive_lap)(maps, *links, steps, moments)))
 
 
 def step_maps(loop: LinearLoop, pose: bool, command: bool, stops: bool) -> Floats:
@@ -106,8 +101,7 @@ def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: i
                     for s in range(states):
                         if transition[s, t] > 0.0:
                             moments[t, i, j] += transition[s, t] * after[s, i, j]
-            for i in range(size):
-                largest = max(largest, moments[t, i, i])
+                    largest = max(largest, abs(moments[t, i, j]))
         if largest > 1e100 or 0.0 < largest < 1e-100:
             for t in range(states):
                 divide(moments[t], largest)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.criteria.criterion import (
+    PLACES_OF_LONG_LAP,
     Criterion,
     Judgement,
     MapColumn,
@@ -31,10 +32,15 @@ def longest_for(loop: LinearLoop, seen: int = 0) -> int:
     return max(seen, LONGEST_PREDICTED) if loop.predicts else LONGEST
 
 
+def largest_n(loop: LinearLoop, longest: int) -> tuple[int | None, int | None]:
+    """As `joint_spectral_radius.largest_n`, of a very long lap at some of its steps."""
+    return joint_spectral_radius.largest_n(loop.thinned(PLACES_OF_LONG_LAP), longest)
+
+
 def _judge(facts: RunFacts) -> Judgement | None:
     if not facts.is_feasible or facts.run.is_late:  # then no fresh pose need end an outage
         return None
-    found = joint_spectral_radius.verdict(facts.loop, facts.n)
+    found = joint_spectral_radius.verdict(facts.loop.thinned(PLACES_OF_LONG_LAP), facts.n)
     stable = {joint_spectral_radius.STABLE: True, UNSTABLE: False}.get(found.verdict)
     return Judgement(
         f"Any outages up to {facts.n} slots", stable, _why(found),
@@ -60,7 +66,7 @@ def _why(found: BurstVerdict) -> str:
 def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     name, label, loop = "n_max.bursts", "Any outages up to n", facts.loop
     longest = longest_for(loop)
-    n, refuted = joint_spectral_radius.largest_n(loop, longest)
+    n, refuted = largest_n(loop, longest)
     reason = ""
     if n is None:
         reason = f"no bound: every burst that was tried contracts, up to {longest} slots"

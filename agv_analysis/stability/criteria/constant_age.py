@@ -9,6 +9,7 @@ import numpy as np
 
 from agv_analysis.stability import floquet, lifted
 from agv_analysis.stability.criteria.criterion import (
+    PLACES_OF_LONG_LAP,
     Criterion,
     Judgement,
     MapColumn,
@@ -33,7 +34,7 @@ _PLACES = 100
 def _judge(facts: RunFacts) -> Judgement | None:
     if not facts.is_feasible:
         return None
-    radius = lifted.largest_radius(facts.loop, facts.n)
+    radius = lifted.largest_radius(facts.loop.thinned(PLACES_OF_LONG_LAP), facts.n)
     return Judgement(
         f"Pose always {facts.n} steps old", radius < 1.0, f"lifted system, spectral radius {radius:.6g}",
         {"lifted_stable": radius < 1.0, "lifted_radius": finite(radius)}, radius,

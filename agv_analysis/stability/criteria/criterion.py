@@ -24,6 +24,9 @@ from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of, loop_of_run, loop_on_lap
 
+PLACES_OF_LONG_LAP = 20_000
+"""Steps, at least, that are asked of a lap that has more: one of 100 s at 5 ms has so many."""
+
 
 class RunFacts:
     """A run, and what several criteria ask of it."""

@@ -18,9 +18,8 @@ from agv_analysis.stability.criteria.criterion import (
 )
 from agv_analysis.stability.linear_loop import LinearLoop
 
-_PLACES, _FEWEST, _WORK = 2000, 50, 5e6
-"""Places of a lap at which a run is judged, at most and at least, and numbers to be moved over them, see `work`: all
-places would take minutes."""
+_PLACES, _FEWEST, _WORK = 2000, 50, 2e7
+"""Places of a lap at which a run is judged, at most and at least, and numbers to be moved over them, see `work`."""
 
 _NAME, _LABEL = "late_poses.mean_square_growth", "Late and lost poses as they are, mean square"
 
@@ -56,7 +55,7 @@ def _why_not(loop: LinearLoop, ages: AgeChain) -> str:
     if loop.predicts and not loop.is_exact:
         return "computed for a pose that is held, not for one that is predicted by a wrong model"
     if delayed_mean_square.work(loop, ages) > delayed_mean_square.MOST_WORK:
-        return f"poses may be {ages.oldest} slots late, which would take minutes to compute"
+        return f"poses may be {ages.oldest} slots late, which would take too long to compute"
     return ""
 
 

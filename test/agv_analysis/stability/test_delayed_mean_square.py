@@ -210,3 +210,16 @@ def test_where_there_is_no_answer_there_is_a_reason() -> None:
         found = margins(load_scenario(PAPER, [*late_line, *settings]))
         assert found["late_poses.mean_square_growth"] is None
         assert said in found.reasons["late_poses.mean_square_growth"]
+
+
+def test_a_complex_pair_has_its_growth_too() -> None:
+    """K_y = 4, K_theta = 1 swings across the line: powers of the recursion never settle, its eigenvalues are known."""
+    gains = ControllerParameters(kx=25.0, ky=4.0, ktheta=1.0)
+    loop, ages = kanayama_loop(np.ones(1), np.zeros(1), gains, TS), behind_constant_delay(bernoulli(0.3), 1)
+    F, G = loop.F[0], loop.G[0]
+    zero, one = np.zeros((3, 3)), np.eye(3)
+    arrives = np.block([[F, G, zero], [one, zero, zero], [zero, one, zero]])  # z, C z(k-1), what is held
+    misses = np.block([[F, zero, G], [one, zero, zero], [zero, zero, one]])
+    operator = 0.7 * np.kron(arrives, arrives) + 0.3 * np.kron(misses, misses)
+    expected = np.log(np.abs(np.linalg.eigvals(operator)).max())
+    assert delayed_mean_square.lap_growth(loop, ages) / loop.steps == pytest.approx(expected, rel=1e-7)
