@@ -33,7 +33,7 @@ _SEEDS = 20
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
-    help="Instead: margins over a grid of two of the control law's gains (kx, ky, ktheta), ts, v and curvature, each "
+    help="Instead, written to --csv and drawn to --picture: margins over a grid of two of the control law's gains (kx, ky, ktheta), ts, v and curvature, each "
     "from a tenth to ten times the scenario's value. Its n_bursts is the longest outage whose repetition dies out; "
     "outages of changing length may allow less, which the margins of one scenario prove.",
 )  # fmt: skip
@@ -115,7 +115,7 @@ def command(
         console.print(f"[bold]Design with[/] {escape(found.recommendation)}.")
     for sentence in found.disagreements():
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
-    if found.infeasible:
+    if found.infeasible and found.infeasible != verdict.reason:
         console.print(f"[bold red]Infeasible:[/] {escape(found.infeasible)}.")
     for note in found.notes:
         console.print(f"[bold yellow]Loss-free motion:[/] {escape(note)}.")

@@ -5,7 +5,9 @@ from __future__ import annotations
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.verdict import (
     ASYMPTOTIC,
+    BESIDE,
     BOUNDED,
+    GREEN,
     INFEASIBLE,
     MEAN_SQUARE,
     SIMULATION,
@@ -21,6 +23,9 @@ def sentence(analysis: Observations) -> str:
     if not isinstance(analysis, Analysis):
         return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
     verdict, met = analysis.verdict, _met(analysis)
+    if verdict.word in GREEN and analysis.evidence.beside_reference > BESIDE:
+        beside = f"The AGV settles up to {analysis.evidence.beside_reference:.3g} m beside its track"
+        return f"{beside}; no update was lost." if analysis.n == 0 else f"{beside}, under {met} as well."
     if verdict.word == MEAN_SQUARE and analysis.run.downlink_lost.any():
         return (
             "The AGV keeps to its track on radio links like these, which lose commands as well, but not in every case."

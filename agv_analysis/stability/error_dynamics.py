@@ -49,6 +49,9 @@ _CLOSED = 1e-11
 _SETTLING_LAPS, _SETTLING_STEPS = 3, 4000
 """Laps, and steps, at least that are driven where Newton's method does not arrive from zero error."""
 
+_SETTLING_SECONDS, _TIMES_LONGER = 600.0, 8
+"""A loop that has not settled by then is driven so many times longer, until it has or this time [s] is over."""
+
 
 class NoNominalMotionError(UserError):
     """The loop does not settle even without losses; the text says how it moves instead."""
@@ -263,25 +266,42 @@ def nominal_motion(model: LoopModel, v_r: Floats, w_r: Floats) -> Floats:
     if found is not None and np.array_equal(found[0], start):
         return found
     laps = max(_SETTLING_LAPS, math.ceil(_SETTLING_STEPS / len(v_r)))
-    driven = model.drive(start, np.tile(v_r, 2 * laps), np.tile(w_r, 2 * laps))
-    if found is None and np.isfinite(driven).all():  # from where the loop goes by itself
-        found = _newton(model, driven[laps * len(v_r)], v_r, w_r)
-    if found is None or not _is_reached(model, found, driven, v_r, w_r):
+    longest = _SETTLING_SECONDS / (2 * len(v_r) * model.settings.ts)
+    while True:
+        driven = model.drive(start, np.tile(v_r, 2 * laps), np.tile(w_r, 2 * laps))
+        is_finite = bool(np.isfinite(driven).all())
+        if found is not None and _is_reached(model, found, driven, v_r, w_r):
+            return found
+        if is_finite:  # from where the loop goes by itself
+            other = _newton(model, driven[laps * len(v_r)], v_r, w_r)
+            if other is not None and _is_reached(model, other, driven, v_r, w_r):
+                return other
+        if laps >= longest or not is_finite:
+            break
+        laps = math.ceil(min(_TIMES_LONGER * laps, longest))
+    if found is None or _is_stable(_lap_of_errors(model, found, v_r, w_r)):
         raise NoNominalMotionError(_what_it_does_instead(model, v_r, w_r))
-    return found
+    return found  # and to be called unstable
+
+
+def _lap_of_errors(model: LoopModel, found: Floats, v_r: Floats, w_r: Floats) -> Floats:
+    return _lap_matrix(model.closed_loop(model.derivatives(found, v_r, w_r)))
+
+
+def _is_stable(lap: Floats) -> bool:
+    return bool(np.isfinite(lap).all()) and float(np.abs(np.linalg.eigvals(lap)).max()) < 1.0 + 1e-6
 
 
 def _is_reached(model: LoopModel, found: Floats, driven: Floats, v_r: Floats, w_r: Floats) -> bool:
-    """Does the loop, begun at zero error, come nearer to a lap that repeats itself, or is this unstable anyway?
+    """Does the loop, begun at zero error, come nearer to a stable lap that repeats itself?
 
-    `driven` are the states of an even number of laps. Newton's method may also find a stable lap to which the loop
-    never comes: far behind the reference, say, where a limit holds all the time. A loop comes nearer if it is nearer in
-    the second half than in the first, or if it moves there as the derivatives say, however slowly that dies out.
+    `driven` are the states of an even number of laps. Newton's method may also find an unstable lap, or a stable one to
+    which the loop never comes: far behind the reference, say, where a limit holds all the time. A loop comes nearer if
+    it is nearer in the second half than in the first, or if it moves there as the derivatives say, however slowly that
+    dies out.
     """
-    lap = _lap_matrix(model.closed_loop(model.derivatives(found, v_r, w_r)))
-    if not np.isfinite(lap).all() or np.abs(np.linalg.eigvals(lap)).max() >= 1.0 + 1e-6:
-        return True
-    if not np.isfinite(driven).all():
+    lap = _lap_of_errors(model, found, v_r, w_r)
+    if not (_is_stable(lap) and np.isfinite(driven).all()):
         return False
     laps, weights = (len(driven) - 1) // len(found), model.weights
     away = np.abs(weights * (driven[:-1] - np.tile(found, (laps, 1)))).max(axis=1)

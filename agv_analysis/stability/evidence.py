@@ -24,8 +24,9 @@ from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
 from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
 from agv_analysis.stability.empirical import with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.repeated_run import RepeatedRun, repeated_run
+from agv_analysis.stability.repeated_run import RepeatedRun, is_disturbed, repeated_run
 from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, UNSTABLE, Evidence, Verdict, decide, weakest
+from agv_cloud.reference.reference import lap_steps
 
 _TIMES_AS_FAR = 2.0
 """A recorded deviation may be this many times the simulated one, for what the model of the plant does not know."""
@@ -35,9 +36,6 @@ _TOLERANCE = 0.05
 
 _PLACES = 2000
 """Places of the lap, at least, at which it is asked how much longer outages may become."""
-
-_NOISE = 6.0
-"""Standard deviations of the measurement noise by which it may be larger."""
 
 
 class Judgements(Mapping[str, Judgement]):
@@ -100,7 +98,14 @@ def _evidence(facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
 
 
 def _common(facts: RunFacts) -> Evidence:
-    return Evidence(n=facts.n, v_max=facts.run.scenario.controller.v_max, infeasible=facts.infeasible)
+    nominal = facts.loop.nominal if facts.is_feasible else None
+    return Evidence(
+        n=facts.n,
+        v_max=facts.run.scenario.controller.v_max,
+        beside_reference=0.0 if nominal is None else float(np.hypot(nominal[:, 0], nominal[:, 1]).max()),
+        is_disturbed=is_disturbed(facts.run.scenario.plant),
+        infeasible=facts.infeasible,
+    )
 
 
 def _under_links_as_seen(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
@@ -152,7 +157,7 @@ def _loses_nothing(run: Run) -> bool:
 def evidence_of_scenario(
     scenario: Scenario, twins: tuple[int, int] | None = None, with_margin: bool = True
 ) -> Evidence:
-    """Of a scenario: as of a run of it, a lap or all that it lasts, but with the channel known where it is a chain.
+    """Of a scenario: as of a run over a lap of its track, but with the channel known where it is a chain.
 
     `twins`: how many of how many simulated runs of it contract the distance of twins. Without the margin, `n_bursts`
     only says whether the longest outage is survived, and nothing is simulated that cannot change the word: that takes a
@@ -160,7 +165,7 @@ def evidence_of_scenario(
 
     Raises TrackFileError if the track's file cannot be used.
     """
-    facts = RunFacts(simulate(with_an_end(scenario)))
+    facts = RunFacts(simulate(_to_judge(scenario)))
     judgements, common = Judgements(facts), replace(_common(facts), twins=twins)
     if not facts.is_feasible:
         return common
@@ -169,6 +174,16 @@ def evidence_of_scenario(
         return found
     found = replace(found, repeated=repeated_run(facts.run, facts.loop))
     return _with_margin(found, facts, judgements) if with_margin else _with_longest(found, facts, judgements)
+
+
+def _to_judge(scenario: Scenario) -> Scenario:
+    """The scenario over a lap, as its margins take it; over all that it lasts where a run has to show its links."""
+    relay, lasts = scenario.relay, scenario.plant.duration
+    lap = lap_steps(scenario.error_detector) * scenario.plant.ts
+    are_known = chain_of(relay.uplink) is not None and chain_of(relay.downlink) is not None
+    if scenario.error_detector.track == "csv" or (lap < lasts < math.inf and not are_known):
+        return with_an_end(scenario)
+    return replace(scenario, plant=replace(scenario.plant, duration=lap))
 
 
 def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
@@ -266,7 +281,7 @@ def _burst_left(fit: ChannelFit, link: LinkConfidence, loop: LinearLoop) -> floa
 
 def _contradictions(run: Run, driven: DrivenCommands, repeated: RepeatedRun | None) -> Iterator[str]:
     """How a recording contradicts what is known of the loop, or leaves out what a judgement needs."""
-    plant, timing = run.scenario.plant, run.timing
+    timing = run.timing
     if driven.differs:
         yield driven.sentence
     if timing is not None and timing.unknown and timing.missed_deadlines:
@@ -274,11 +289,11 @@ def _contradictions(run: Run, driven: DrivenCommands, repeated: RepeatedRun | No
     if repeated is None:
         yield "steps are missing from the recording, so that the loop cannot be simulated under its losses"
         return
-    if plant.slip_noise > 0.0 or not math.isfinite(repeated.largest_in_run):
+    if not math.isfinite(repeated.largest_in_run):
         return
     later = slice(len(run) // 2, None)
     recorded = float(np.hypot(*(run.pose - run.reference[:, :3])[later, :2].T).max())
-    allowed = _TIMES_AS_FAR * repeated.largest_in_run + _TOLERANCE + _NOISE * plant.noise_xy
+    allowed = _TIMES_AS_FAR * repeated.largest_in_run + _TOLERANCE
     if not recorded <= allowed:
         yield (
             f"the AGV was up to {recorded:.3g} m off its track, in the simulation under the same losses up to "

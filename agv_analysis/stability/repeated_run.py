@@ -8,7 +8,8 @@ functions that the nodes call, for as many repetitions of the run's track and lo
 - with the losses: does the largest deviation grow from one third of the time to the next?
 
 The losses are those of the run, and the same moved against the track by a third of it and by two. Measurement noise and
-slip are left out: what a loop forgets does not depend on them.
+slip are left out, but where a deviation is to be compared with the recorded one: what a loop forgets does not depend on
+them.
 """
 
 from __future__ import annotations
@@ -29,12 +30,14 @@ from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import LinkInputs, empty_trace, history_over_links, link_that_holds
 from agv_analysis.simulation.loop import Loop, RunInputs, history
+from agv_analysis.simulation.noise import normals
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.reference import repeated
 from agv_analysis.simulation.single import settings_of, start_of
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of
-from agv_plant.parameters import RelayParameters
+from agv_plant.parameters import PlantParameters, RelayParameters
+from agv_plant.vehicle.motion import NOISE, SLIP
 from agv_ros.pose import Pose, direction_of
 
 SECONDS = 600.0
@@ -86,7 +89,7 @@ class RepeatedRun:
     """Largest distance from the reference in the last third [m], of the runs with the losses and of one that does not
     settle without any; inf if the loop diverges."""
     largest_in_run: float
-    """Largest distance from the reference in the second half of the first repetition, which is the run [m]."""
+    """Largest distance from the reference in the second half of the run, simulated with its noise and slip [m]."""
     unsettled: str = ""
     """Where it does not settle: what does not do what; empty if it settles."""
 
@@ -116,7 +119,10 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
         deviation = _deviation(begun, reference)
         thirds.append(_largest_of_thirds(deviation, steps))
         if shift == 0:
-            in_run = deviation[steps // 2 : steps]
+            in_run = deviation[:steps]
+    if is_disturbed(run.scenario.plant):
+        once = reference[: steps + run.scenario.controller.steps_ahead]
+        in_run = _deviation(_under_losses(run, once, starts[0], 1, 0, with_noise=True), reference)
     if unsettled is not None:
         thirds.append(_largest_of_thirds(_deviation(unsettled[1], reference), steps))
     return RepeatedRun(
@@ -125,9 +131,14 @@ def repeated_run(run: Run, loop: LinearLoop) -> RepeatedRun | None:
         meets=meets,
         stays=all(_does_not_grow(before, last) for before, last in thirds),
         largest_deviation=max(last for _, last in thirds),
-        largest_in_run=float(in_run.max()),
+        largest_in_run=float(in_run[steps // 2 :].max()),
         unsettled="" if unsettled is None else unsettled[0],
     )
+
+
+def is_disturbed(plant: PlantParameters) -> bool:
+    """Do measurement noise or slip keep an AGV moving?"""
+    return plant.is_noisy or plant.slip_noise > 0.0
 
 
 def _unsettled(run: Run, reference: Floats, count: int, loop: LinearLoop) -> tuple[str, Floats] | None:
@@ -171,9 +182,10 @@ def _pose_of_nominal(reference: Floats, loop: LinearLoop) -> Floats:
 
 
 def settles_without_losses(scenario: Scenario) -> bool:
-    """Does the loop, driven for three laps without losses, forget where it began and stay as near as it came?
+    """Does the loop, driven without losses, forget where it began and stay as near as it came?
 
-    By simulation alone, in milliseconds; `error_dynamics.nominal_motion` says where it settles, and why it does not.
+    By simulation alone, in milliseconds: three laps, and ten minutes where these do not show it;
+    `error_dynamics.nominal_motion` says where it settles, and why it does not.
     Raises TrackFileError if the track's file cannot be used, PartError if a part raises.
     """
     relay = replace(RelayParameters(), ts=scenario.relay.ts, start_time=scenario.relay.start_time)
@@ -183,9 +195,14 @@ def settles_without_losses(scenario: Scenario) -> bool:
 @functools.lru_cache(maxsize=1024)
 def _settles_without_losses(scenario: Scenario) -> bool:
     lap = lap_of(scenario)
-    reference = _repeated_reference(scenario, lap, _LAPS)
+    longer = math.ceil(SECONDS / (len(lap) * scenario.plant.ts))
+    return any(_settles_in(scenario, lap, laps) for laps in (_LAPS, longer) if laps >= _LAPS)
+
+
+def _settles_in(scenario: Scenario, lap: Floats, laps: int) -> bool:
+    reference = _repeated_reference(scenario, lap, laps)
     starts = _starts(scenario, np.array(scenario.plant.initial_pose), lap[0])
-    one, two = (_without_losses(scenario, reference, start, _LAPS * len(lap)) for start in (starts[0], starts[-1]))
+    one, two = (_without_losses(scenario, reference, start, laps * len(lap)) for start in (starts[0], starts[-1]))
     moves = bool(lap[:, 3:].any())
     return _does_not_grow(*_largest_of_thirds(_deviation(one, reference), len(lap))) and (
         not moves or _meets(one, two, np.arange(3))
@@ -230,12 +247,15 @@ def _without_losses(scenario: Scenario, reference: Floats, start: Loop, steps: i
     return _direct(scenario, reference, RunInputs(nothing, nothing, start, settings_of(scenario)))
 
 
-def _under_losses(run: Run, reference: Floats, start: Loop, count: int, shift: int) -> Floats:
+def _under_losses(run: Run, reference: Floats, start: Loop, count: int, shift: int, with_noise: bool = False) -> Floats:
     """As `_without_losses`, under the losses, moved by so many slots, and the delays of a run."""
     lost, downlink_lost = (
         np.resize(np.roll(outcomes, shift), count * len(run)) for outcomes in (run.lost, run.downlink_lost)
     )
-    inputs = RunInputs(numbers(lost), numbers(downlink_lost), start, settings_of(run.scenario))
+    plant = run.scenario.plant
+    noise = numbers(normals(plant.seed, NOISE, len(lost))) if with_noise and plant.is_noisy else None
+    slip = numbers(normals(plant.seed, SLIP, len(lost))) if with_noise and plant.slip_noise > 0.0 else None
+    inputs = RunInputs(numbers(lost), numbers(downlink_lost), start, settings_of(run.scenario), noise, slip)
     if not _is_late(run):
         return _direct(run.scenario, reference, inputs)
     up, down = (_link(age, count) for age in (run.command_age, _downlink_ages(run)))

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence
 from agv_analysis.stability.driven_commands import DrivenCommands
@@ -49,6 +49,9 @@ SIMULATION = "simulation"
 
 SURE = 0.95
 """A green word needs at least this probability of a stable loop, `unstable` at most 1 less this."""
+
+BESIDE = 0.05
+"""A loop that stays further [m] from its reference than this says so beside a green word."""
 
 _SURE_OF_RUNS = 0.9
 """Share of simulated runs, at least, that must contract; a few end inside an outage."""
@@ -100,6 +103,10 @@ class Evidence:
     """Why nothing is sure, where there is no `link` that says so."""
     v_max: float = math.inf
     """Limit on the speed [m/s]."""
+    beside_reference: float = 0.0
+    """Largest distance [m] from the reference of the motion to which the loop settles without losses."""
+    is_disturbed: bool = False
+    """Does measurement noise or slip keep the AGV moving about that motion, which the criteria know nothing of?"""
     infeasible: str = ""
     """Why the loop does not settle even without losses."""
     missing: int = 0
@@ -133,7 +140,17 @@ def decide(evidence: Evidence) -> Verdict:
     against = _against_stability(evidence)
     if word.word in (*GREEN, UNDECIDED, UNKNOWN) and against:
         return _not_stable(evidence, SIMULATION, against)
-    return word
+    return replace(word, reason=word.reason + _where(evidence)) if word.word in GREEN else word
+
+
+def _where(evidence: Evidence) -> str:
+    """How far from its reference a stable loop drives, where that is far."""
+    where, repeated = "", evidence.repeated
+    if evidence.beside_reference > BESIDE:
+        where += f"; even without losses it drives up to {evidence.beside_reference:.3g} m beside its reference"
+    if evidence.is_disturbed and repeated is not None and repeated.largest_in_run > BESIDE:
+        where += f"; with its noise and slip, which are left out of this, up to {repeated.largest_in_run:.3g} m"
+    return where
 
 
 def weakest(verdicts: Sequence[Verdict]) -> Verdict:

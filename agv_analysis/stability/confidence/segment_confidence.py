@@ -172,7 +172,7 @@ def _of_gilbert(posterior: GrowthPosterior, intervals: Intervals, goodness: Good
         why = f"a Gilbert channel does not describe the outcomes, and {_counted(count, 'complete outage')} are too few"
     if intervals.longest_open and intervals.longest_open >= intervals.outages.max(initial=0):
         why += f"; an outage of at least {intervals.longest_open} slots was not seen whole"
-    if goodness.fits and tail_is_heavy(intervals.outages, _ADVANTAGE):
+    if probability > 1.0 - SURE and goodness.fits and tail_is_heavy(intervals.outages, _ADVANTAGE):
         probability, why = min(probability, 0.5), _HEAVY
     undecided = 1.0 - SURE < probability < SURE
     longer = posterior.times_longer() if undecided and goodness.fits else None
@@ -188,7 +188,7 @@ def _of_intervals(loop: LinearLoop, intervals: Intervals, goodness: Goodness) ->
     why = "outages are those of no Gilbert channel, so the intervals between receptions were judged as they are"
     if found.block > 1:
         why += f", {found.block} at a time, because they depend on each other"
-    if heavy:
+    if heavy and probability > 1.0 - SURE:  # else it grows with and without a mean square of theirs
         probability = min(probability, 0.5)
         why = _HEAVY
     elif probability > 0.5 and dependent and grows_for_a_while(loop, lengths):

@@ -13,7 +13,9 @@ from agv_analysis.run import ParameterChange, Run, Timing
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.analysis import Analysis, analyse
+from agv_analysis.stability.confidence.link_confidence import link_confidence
 from agv_analysis.stability.evidence import evidence_of_scenario
+from agv_analysis.stability.scenario_loop import loop_of_run
 from agv_analysis.stability.verdict import GREEN, decide
 from agv_analysis.sweep.collect import collect
 from agv_analysis.sweep.execute import on_this_machine
@@ -225,3 +227,37 @@ def test_a_steady_drift_is_called_one() -> None:
     found = of(LINE, "controller.v_max=1.05", "plant.slip=0.1")
     assert found.verdict.word == "infeasible"
     assert "falls behind its reference by 0.055 m/s" in found.verdict.reason
+
+
+def test_a_limit_below_the_reference_s_speed_is_one_thing_on_all_closed_tracks() -> None:
+    """At 0.8 m/s on a circle of 100 m at 1 m/s it settles, slowly, on one of 80 m: 8.09 m behind its reference."""
+    for track in ("circle", "eight"):
+        found = of(f"error_detector.track={track}", "controller.v_max=0.8")
+        assert found.verdict.word == "asymptotic"
+        last = slice(-len(found.run) // 4, None)
+        away = np.hypot(*(found.run.pose - found.run.reference[:, :3])[last, :2].T).max()
+        assert found.evidence.beside_reference == pytest.approx(away, rel=0.1)
+        assert f"even without losses it drives up to {found.evidence.beside_reference:.3g} m" in found.verdict.reason
+
+
+def test_a_limit_of_just_the_reference_s_speed_never_makes_up_for_what_was_lost() -> None:
+    assert of(LINE, "controller.v_max=1.0").verdict.word == "bounded"
+    assert of(LINE, "controller.v_max=1.05").verdict.word == "asymptotic"
+
+
+def test_a_noisy_run_is_no_contradiction_to_its_own_simulation() -> None:
+    found = of(LINE, "plant.noise_theta=0.5", "plant.noise_xy=5.0", "plant.duration=20.0")
+    assert found.verdict.word == "asymptotic"
+    assert "with its noise and slip, which are left out of this, up to" in found.verdict.reason
+
+
+def test_the_reason_of_an_unstable_word_is_no_reason_for_doubt() -> None:
+    """Outages of 2 slots, a few of 400: with or without a mean square of their lengths the error grows."""
+    run = simulate(scenario_of(LINE, "controller.kx=100.0"))
+    rng = np.random.default_rng(5)
+    lost = np.concatenate([
+        [False, *[True] * (400 if rng.random() < 0.05 else 4 + int(rng.integers(3)))] for _ in range(2000)
+    ])[: len(run)]  # fmt: skip
+    found = link_confidence(loop_of_run(run), run.k, lost, run.ts)
+    assert found.probability_stable < 0.05
+    assert "may not exist" not in found.reason
