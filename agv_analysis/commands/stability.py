@@ -33,9 +33,10 @@ _SEEDS = 20
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
-    help="Instead, written to --csv and drawn to --picture: margins over a grid of two of the control law's gains (kx, ky, ktheta), ts, v and curvature, each "
-    "from a tenth to ten times the scenario's value. Its n_bursts is the longest outage whose repetition dies out; "
-    "outages of changing length may allow less, which the margins of one scenario prove.",
+    help="Instead, to the files of --csv and --picture: margins over a grid of two of the control law's gains (kx, ky, "
+    "ktheta), ts, v and curvature, each from a tenth to ten times the scenario's value. Its n_bursts is the longest "
+    "outage whose repetition dies out; outages of changing length may allow less, which the margins of one scenario "
+    "prove.",
 )  # fmt: skip
 @click.option("--points", type=click.IntRange(2, 1000), default=100, show_default=True, help="Points of each axis.")
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Where the map goes, map.csv by default.")

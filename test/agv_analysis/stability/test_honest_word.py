@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agv_analysis.link.heavy_tail import tail_is_heavy
+from agv_analysis.link.reception_intervals import reception_intervals
 from agv_analysis.run import ParameterChange, Run, Timing
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
@@ -252,12 +254,11 @@ def test_a_noisy_run_is_no_contradiction_to_its_own_simulation() -> None:
 
 
 def test_the_reason_of_an_unstable_word_is_no_reason_for_doubt() -> None:
-    """Outages of 2 slots, a few of 400: with or without a mean square of their lengths the error grows."""
+    """Pareto's outages, far too long for K_x = 100: with or without a mean square of their lengths the error grows."""
     run = simulate(scenario_of(LINE, "controller.kx=100.0"))
     rng = np.random.default_rng(5)
-    lost = np.concatenate([
-        [False, *[True] * (400 if rng.random() < 0.05 else 4 + int(rng.integers(3)))] for _ in range(2000)
-    ])[: len(run)]  # fmt: skip
+    lost = np.concatenate([[False, *[True] * int(3.0 / rng.random() ** (1.0 / 1.5))] for _ in range(5000)])[: len(run)]
+    assert tail_is_heavy(reception_intervals(run.k, lost).outages)
     found = link_confidence(loop_of_run(run), run.k, lost, run.ts)
     assert found.probability_stable < 0.05
     assert "may not exist" not in found.reason
