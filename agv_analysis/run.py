@@ -146,6 +146,18 @@ class Run:
         return self.n_ul if self.timing is None or not self.timing.is_late else self.timing.command_age
 
     @property
+    def acting_age(self) -> NDArray[np.int64]:
+        """Steps since the pose behind the command that the plant holds at step k, shape (N,).
+
+        The age of the command and that of the pose when the command was computed; `command_age` where a run does not
+        say how old commands were, or its timing was not what its slots say.
+        """
+        if self.n_dl is None or self.is_late:
+            return self.command_age
+        sent = np.maximum(np.arange(len(self)) - self.n_dl, 0)
+        return np.asarray(self.n_dl + self.n_ul[sent])
+
+    @property
     def is_late(self) -> bool:
         """Were poses or commands older than the slots say, by receive time?"""
         return self.timing is not None and self.timing.is_late

@@ -25,12 +25,12 @@ def sentence(analysis: Observations) -> str:
     verdict, met = analysis.verdict, _met(analysis)
     if verdict.word in GREEN and analysis.evidence.beside_reference > BESIDE:
         beside = f"The AGV settles up to {analysis.evidence.beside_reference:.3g} m beside its track"
-        return f"{beside}; no update was lost." if analysis.n == 0 else f"{beside}, under {met} as well."
+        return f"{beside}; no update was lost." if _oldest(analysis) == 0 else f"{beside}, under {met} as well."
     if verdict.word == MEAN_SQUARE and analysis.run.downlink_lost.any():
         return (
             "The AGV keeps to its track on radio links like these, which lose commands as well, but not in every case."
         )
-    if verdict.word == ASYMPTOTIC and analysis.n == 0:
+    if verdict.word == ASYMPTOTIC and _oldest(analysis) == 0:
         return "The AGV keeps to its track; no update was lost."
     if verdict.word == ASYMPTOTIC and _is_late(analysis):
         return f"The AGV keeps to its track with {met}."
@@ -42,7 +42,7 @@ def sentence(analysis: Observations) -> str:
         return f"Whether the loop is stable cannot be said: {verdict.reason}."
     if verdict.word == INFEASIBLE:
         return f"The AGV does not keep to its track even on a perfect link: {analysis.infeasible}."
-    if verdict.criterion == SIMULATION or (analysis.n == 0 and not analysis.run.downlink_lost.any()):
+    if verdict.criterion == SIMULATION or (_oldest(analysis) == 0 and not analysis.run.downlink_lost.any()):
         return f"The AGV does not keep to its track: {verdict.reason}."
     if verdict.word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."
@@ -84,15 +84,21 @@ def _in_mean_square(analysis: Analysis, met: str) -> str:
 
 
 def _is_late(analysis: Observations) -> bool:
-    """Were poses older than outages explain, because messages were delayed?"""
-    return analysis.n > analysis.outages.uplink.longest
+    """Were the poses behind commands older than outages explain, because messages were delayed?"""
+    return _oldest(analysis) > analysis.outages.uplink.longest and not analysis.run.downlink_lost.any()
+
+
+def _oldest(analysis: Observations) -> int:
+    """Age of the oldest pose behind a command that acted [steps]."""
+    return max(analysis.n, analysis.evidence.n) if isinstance(analysis, Analysis) else analysis.n
 
 
 def _met(analysis: Observations) -> str:
     """The worst that the run has met."""
-    age = f"{analysis.n * analysis.run.ts * 1e3:g} ms"
+    oldest = _oldest(analysis)
+    age = f"{oldest * analysis.run.ts * 1e3:g} ms"
     if _is_late(analysis):
-        return f"poses up to {analysis.n} steps ({age}) old"
+        return f"poses up to {oldest} steps ({age}) old"
     if analysis.run.downlink_lost.any():
         return "losses on both links, of poses and of commands,"
     return f"outages of {analysis.n} lost updates in a row ({age})"

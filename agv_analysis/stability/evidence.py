@@ -12,14 +12,15 @@ from agv_analysis.link import joint_chain
 from agv_analysis.link.channel_fit import ChannelFit
 from agv_analysis.link.joint_chain import JointChain
 from agv_analysis.link.markov_channel import Chain, chain_of, gilbert_elliott
+from agv_analysis.link.periodic_outages import period_of
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability import mean_square, mean_square_two_links
+from agv_analysis.stability import lifted, mean_square, mean_square_two_links
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import largest_n, longest_for
-from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, has_late
+from agv_analysis.stability.criteria.criterion import PLACES_OF_LONG_LAP, Judgement, RunFacts, has_late
 from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
 from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
 from agv_analysis.stability.empirical import with_an_end
@@ -208,20 +209,23 @@ def _is_random(chain: Chain) -> bool:
 
 
 def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
-    run, delay = facts.run, _constant_delay(facts.run)
+    run, delay = facts.run, _constant_delay(facts)
     if delay is not None:
-        return replace(common, late_by=delay, lifted_radius=judgements["lifted"].detail)
-    late = judgements.get("late_and_lost")
+        radius = lifted.largest_radius(facts.loop.thinned(PLACES_OF_LONG_LAP), delay)
+        return replace(common, n=delay, late_by=delay, lifted_radius=radius)
+    late, of_ages = judgements.get("late_and_lost"), judgements["recorded_losses"].stable
     if late is not None and not run.is_late:
         growth = late.detail
-        is_sure = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
-        return _with_growth(common, growth, "late_and_lost", "" if is_sure else "the halves of the run do not agree")
+        agree = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
+        unsure = "" if agree else "the halves of the run do not agree"
+        if has_late(run.downlink) and of_ages is not (growth < 0.0):  # ages that add up are no chain of their own
+            unsure = "the chain of ages and these very ages do not agree"
+        return _with_growth(common, growth, "late_and_lost", unsure)
     why = "messages were late, by no constant delay, which no criterion covers"
     if has_late(run.downlink):
         why = "commands were late, which no criterion covers"
     if run.is_late:
         why = "poses or commands came later than their slots say, which no criterion covers"
-    of_ages = judgements["recorded_losses"].stable
     if of_ages is not None:
         why += f"; under these very ages a small error {'shrinks' if of_ages else 'grows'}"
     return replace(common, not_covered=why)
@@ -233,11 +237,15 @@ def _with_growth(common: Evidence, growth: float, growth_of: str = "mean_square"
     return replace(common, growth=growth, growth_of=growth_of, probability_stable=probability, seen=unsure)
 
 
-def _constant_delay(run: Run) -> int | None:
-    """Age of the pose in slots, if it is always the same, but for the beginning, and commands are there at once."""
-    n = int(run.command_age.max())
-    is_direct = not (run.downlink_lost.any() or has_late(run.downlink))
-    return n if is_direct and np.array_equal(run.command_age, np.minimum(run.k, n)) else None
+def _constant_delay(facts: RunFacts) -> int | None:
+    """Age of the pose behind the acting command in slots, if it is always the same, but for the beginning."""
+    run = facts.run
+    commands_wait = has_late(run.downlink) or run.downlink_lost.any()
+    if commands_wait and not facts.ages_add_up:
+        return None
+    age = run.acting_age if commands_wait else run.command_age
+    n = int(age.max())
+    return n if np.array_equal(age, np.minimum(run.k, n)) else None
 
 
 def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
@@ -246,7 +254,7 @@ def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, J
     policy = run.scenario.plant.downlink_policy
     if growth is None:
         why = f"commands were lost, and no criterion covers downlink policy {policy}"
-        return replace(common, not_covered=why)
+        return replace(common, not_covered=why, goes_on=_goes_on(run))
 
     def growth_under(links: JointChain) -> float:
         return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
@@ -261,6 +269,18 @@ def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, J
     is_sure = bool(others) and all(growth_under(links) * growth > 0.0 for links in others)
     unsure = "" if is_sure else "too few outages of both links were seen to say whether the mean square dies out"
     return _with_growth(common, growth, "both_links", unsure)
+
+
+def _goes_on(run: Run) -> float:
+    """How probable it is that the outcomes of both links repeat as they did, exactly; 0 where they did not.
+
+    As of outages that repeat on one link: sure after ten periods.
+    """
+    periods = [period_of(run.k, lost) if lost.any() else 1 for lost in (run.lost, run.downlink_lost)]
+    if any(period is None for period in periods):
+        return 0.0
+    times = len(run) // math.lcm(*(period for period in periods if period is not None))
+    return (times + 0.5) / (times + 1.0) if times > 1 else 0.0
 
 
 def _at_end(fit: ChannelFit, end: int) -> Chain:

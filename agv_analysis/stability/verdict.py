@@ -91,6 +91,8 @@ class Evidence:
     """By what factor outages may become longer on average before `growth` is positive; None: unknown or no bound."""
     not_covered: str = ""
     """Why `growth` is None."""
+    goes_on: float = 0.0
+    """Where no criterion covers the links: how probable it is that their outcomes repeat exactly as they did."""
     late_by: int | None = None
     """The constant age of each pose [slots], if all were late by the same; then `lifted_radius` decides."""
     lifted_radius: float = 0.0
@@ -162,6 +164,8 @@ def _by_criteria(evidence: Evidence) -> Verdict:
     """The word by the linear criteria and by how much was seen of the link."""
     if evidence.late_by is not None:
         return _late(evidence)
+    if evidence.growth is None and evidence.goes_on >= SURE and evidence.repeated is not None:
+        return _repeating(evidence)
     if evidence.growth is None:
         return Verdict(UNKNOWN, "none", f"unknown: {evidence.not_covered}", evidence.not_covered)
     if evidence.probability_stable <= 1.0 - SURE:
@@ -180,6 +184,12 @@ def _by_criteria(evidence: Evidence) -> Verdict:
     return _mean_square(evidence)
 
 
+def _repeating(evidence: Evidence) -> Verdict:
+    """By the simulation alone, which drives what will come; if that is not stable it says so as of any other word."""
+    why = "the outcomes of the links repeat exactly, and simulated under them the error dies out"
+    return Verdict(MEAN_SQUARE, SIMULATION, f"{why}; no criterion covers other outcomes", why)
+
+
 def _mean_square(evidence: Evidence) -> Verdict:
     reason = _of_link(evidence) or "under this link the mean square of the error dies out"
     if evidence.growth_of == "both_links":
@@ -194,7 +204,7 @@ def _mean_square(evidence: Evidence) -> Verdict:
 
 
 def _late(evidence: Evidence) -> Verdict:
-    age = f"each pose is {evidence.late_by} steps old"
+    age = f"each pose is {evidence.late_by} steps old when its command acts"
     if evidence.lifted_radius < 1.0:
         shrinks = f"{age}, and the error shrinks"
         return Verdict(ASYMPTOTIC, "lifted", f"{shrinks}; see n_max of stability", shrinks)

@@ -65,6 +65,11 @@ class RunFacts:
         """Did messages arrive in a later slot than their own, by what the slots say or by when they came?"""
         return has_late(self.run.uplink) or has_late(self.run.downlink) or self.run.is_late
 
+    @property
+    def ages_add_up(self) -> bool:
+        """Does the AGV act on `Run.acting_age`: do plant and edge hold the newest that they have, however old?"""
+        return not self.loop.predicts and self.run.scenario.plant.downlink_policy == "hold"
+
     @cached_property
     def fit(self) -> ChannelFit:
         """The uplink as fitted to the run."""

@@ -27,10 +27,13 @@ _NAME, _LABEL = "late_poses.mean_square_growth", "Late and lost poses as they ar
 def growth_of_late_poses(facts: RunFacts) -> float | None:
     """Growth of E[e^2] per step under the chain of ages fitted to a run; None where it does not apply.
 
-    It does where poses came late, by whatever delays, and commands came at once.
+    It does where messages came late, by whatever delays; where commands were late or lost as well, their ages and those
+    of the poses must add up.
     """
     run = facts.run
-    if not (facts.is_feasible and has_late(run.uplink)) or has_late(run.downlink) or run.downlink_lost.any():
+    if not (facts.is_feasible and (has_late(run.uplink) or has_late(run.downlink))):
+        return None
+    if (has_late(run.downlink) or run.downlink_lost.any()) and not facts.ages_add_up:
         return None
     if len(run) < 2 or int(run.k[-1] - run.k[0]) + 1 != len(run):
         return None
@@ -44,7 +47,7 @@ def growths_of_halves(facts: RunFacts) -> tuple[float | None, float | None]:
 
 
 def _growth(facts: RunFacts, rows: slice) -> float | None:
-    ages = fitted_ages(facts.run.n_ul[rows])
+    ages = fitted_ages((facts.run.acting_age if facts.ages_add_up else facts.run.n_ul)[rows])
     share = _WORK / max(1.0, delayed_mean_square.work(facts.loop, ages))
     loop = facts.loop.thinned(min(_PLACES, max(_FEWEST, round(share * facts.loop.steps))))
     return None if _why_not(loop, ages) else delayed_mean_square.lap_growth(loop, ages) / loop.steps
@@ -64,7 +67,7 @@ def _judge(facts: RunFacts) -> Judgement | None:
     if growth is None:
         return None
     return Judgement(
-        "Late and lost poses, mean square", growth < 0.0, f"{growth_text(growth)} under the chain of ages that fits",
+        "Late and lost messages, mean square", growth < 0.0, f"{growth_text(growth)} under the chain of ages that fits",
         {"late_mean_square_stable": growth < 0.0, "late_mean_square_growth": finite(growth)}, growth,
     )  # fmt: skip
 
@@ -94,7 +97,7 @@ CRITERION = Criterion(
     title="Late and lost poses, mean square",
     asks="Does E[|e|^2] die out if poses are late as well as lost?",
     assumes="That the age of the pose is a Markov chain: any losses behind a constant delay, or independent losses and "
-    "delays; of a run the ages that it shows. Commands arrive at once.",
+    "delays; of a run the ages that it shows. Commands arrive at once; of a run also late, if plant and edge hold.",
     judge=_judge,
     margins=_margins,
     margin_names=((_NAME, _LABEL),),

@@ -7,7 +7,6 @@ import numpy as np
 from agv_analysis.run import Run
 from agv_analysis.stability import driven_motion, floquet, variable_delay
 from agv_analysis.stability.criteria.criterion import Criterion, Judgement, RunFacts, finite, has_late
-from agv_analysis.stability.linear_loop import LinearLoop
 
 
 def _judge(facts: RunFacts) -> Judgement | None:
@@ -31,7 +30,7 @@ def _contractions(facts: RunFacts) -> tuple[float | None, float | None]:
     """Growth factors per step from the first pose received on: about the reference, and about the driven motion."""
     run, loop = facts.run, facts.loop
     if facts.is_late:
-        return _late_contraction(run, loop), None
+        return _late_contraction(facts), None
     first = int(np.argmin(run.lost))
     steps = len(run) - first
     if run.lost[first] or int(run.k[-1] - run.k[first]) + 1 != steps:
@@ -43,13 +42,15 @@ def _contractions(facts: RunFacts) -> tuple[float | None, float | None]:
     return per_step, None if of_motion is None else finite(float(np.exp(of_motion / steps)))
 
 
-def _late_contraction(run: Run, loop: LinearLoop) -> float | None:
+def _late_contraction(facts: RunFacts) -> float | None:
     """Growth factor per step about the reference from the first step on; None for what `variable_delay` cannot say."""
+    run, loop = facts.run, facts.loop
     is_whole = run.k[0] == 0 and int(run.k[-1]) + 1 == len(run)
-    if loop.predicts or not is_whole or has_late(run.downlink) or not _held_its_command(run):
+    commands_wait = has_late(run.downlink) or run.downlink_lost.any()
+    if loop.predicts or not is_whole or (commands_wait and not facts.ages_add_up) or not _held_its_command(run):
         return None
     with np.errstate(all="ignore"):
-        growth = variable_delay.age_sequence(loop, run.command_age)
+        growth = variable_delay.age_sequence(loop, run.acting_age if facts.ages_add_up else run.command_age)
     return finite(float(np.exp(growth / len(run))))
 
 

@@ -11,9 +11,10 @@ import pytest
 
 from agv_analysis.link.heavy_tail import tail_is_heavy
 from agv_analysis.link.reception_intervals import reception_intervals
+from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.run import ParameterChange, Run, Timing
 from agv_analysis.scenario import Scenario, load_scenario
-from agv_analysis.simulation import simulate
+from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.stability.analysis import Analysis, analyse
 from agv_analysis.stability.confidence.link_confidence import link_confidence
 from agv_analysis.stability.evidence import evidence_of_scenario
@@ -190,11 +191,32 @@ def test_missed_deadlines_without_a_record_of_when_messages_came() -> None:
     assert "153 deadlines were missed" in found.verdict.reason
 
 
-def test_late_commands_are_called_late_commands() -> None:
-    """Each command is 6 steps late: a constant delay, but of the link that no criterion covers."""
-    found = analyse(simulate(load_scenario(PAPER, ["error_detector.track=line", "relay.downlink.delay=0.03"])))
-    assert found.verdict.word == "unknown"
-    assert found.verdict.reason == "commands were late, which no criterion covers"
+@pytest.mark.parametrize(("delay", "word"), [(0.06, "asymptotic"), (0.065, "unstable")])
+def test_late_commands_are_judged_by_the_age_of_the_pose_behind_them(delay: float, word: str) -> None:
+    """At K_x = 25 a pose that is always 12 steps old is survived, 13 are not, wherever it waits."""
+    scenario = scenario_of(LINE, f"relay.downlink.delay={delay}", "plant.duration=20.0")
+    assert (simulate_batch([scenario], [1], twins=True)["contraction"][0, 0] < 1.0) == (word == "asymptotic")
+    found = analyse(simulate(scenario))
+    assert found.verdict.word == word
+    assert f"{round(delay / 0.005)} steps old when its command acts" in found.verdict.reason
+    assert f"poses up to {round(delay / 0.005)} steps ({delay * 1e3:g} ms) old" in sentence(found)
+
+
+def test_late_commands_behind_a_predictor_are_not_judged() -> None:
+    found = of(LINE, "relay.downlink.delay=0.03", "error_detector.policy=predict", "plant.duration=20.0")
+    assert (found.verdict.word, found.verdict.reason) == ("unknown", "commands were late, which no criterion covers")
+
+
+@pytest.mark.parametrize(("n", "kx", "word"), [(5, 25.0, "mean-square"), (40, 100.0, "unstable")])
+def test_outcomes_that_repeat_exactly_are_judged_by_simulation_where_no_criterion_is(
+    n: int, kx: float, word: str
+) -> None:
+    lossy = ("relay.downlink.model=burst", f"relay.downlink.n={n}", "plant.downlink_policy=ramp")
+    scenario = scenario_of(LINE, *lossy, f"controller.kx={kx}", "plant.duration=20.0", "plant.ramp_time=1.0")
+    contracts = simulate_batch([scenario], [1], twins=True)["contraction"][0, 0] < 1.0
+    found = analyse(simulate(scenario))
+    assert (found.verdict.word, contracts) == (word, word == "mean-square")
+    assert found.verdict.criterion == "simulation"
 
 
 @pytest.mark.parametrize("first", [1, 5])
