@@ -15,7 +15,6 @@ them.
 from __future__ import annotations
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -67,7 +66,10 @@ _BESIDE = (-0.5, -0.2, -0.1, -0.01, -_APART, _APART, 0.01, 0.1, 0.2, 0.5)
 """So far [m, m, rad] beside it a loop must settle without losses as well: one that swings may settle by chance."""
 
 _SHRINKING = 0.7
-"""A distance that is below this share of what it was a quarter of the time before goes on shrinking."""
+"""A distance that is below this share of what it was a quarter of the time before, on average, goes on shrinking."""
+
+_NOT_FAR = 1.0
+"""Beyond this distance [m, m, rad] a loop may wander, and come nearer for a while."""
 
 _GROWING = 1.4
 """A largest deviation above this multiple of that of the third before is growing: a steady drift has 1.5."""
@@ -315,10 +317,15 @@ def _moments(steps: int) -> list[NDArray[np.int64]]:
 
 
 def _is_small_or_shrinks(distances: Sequence[Floats], small: float) -> bool:
-    """Is a distance small at the last two of the `_moments`, or does it shrink from each of them to the next?"""
-    found = [float(np.median(distance)) for distance in distances]
-    shrinks = all(later < _SHRINKING * before for before, later in itertools.pairwise(found))
-    return math.isfinite(found[-1]) and (max(found[-2:]) <= small or shrinks)
+    """Is a distance small at the last two of the `_moments`, or does it shrink from each of them to the next?
+
+    One that is no longer far may shrink little from one moment to the next if it does so from each to the next but one:
+    after an odd number of half laps the same loop may be nearer than after whole ones.
+    """
+    a, b, c, d = (float(np.median(distance)) for distance in distances)
+    shrinks = b < _SHRINKING * a and c < _SHRINKING * b and d < _SHRINKING * c
+    by_two = c < _SHRINKING**2 * a and d < _SHRINKING**2 * b and a <= _NOT_FAR and d < c < b < a
+    return math.isfinite(d) and (max(c, d) <= small or shrinks or by_two)
 
 
 def _settles(poses: Floats, reference: Floats, scenario: Scenario, loop: LinearLoop, may_be_elsewhere: bool) -> bool:
