@@ -125,7 +125,9 @@ def command(
     if found.left_out:
         console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
     if json_file is not None:
-        word: dict[str, Any] = {**verdict.to_json(), "confidence": evidence.confidence}
+        link = evidence.link  # as a run shows it, where the channel is not known
+        fit = None if link is None else {"goodness": link.goodness.to_json()}
+        word: dict[str, Any] = {**verdict.to_json(), "margin": verdict.margin, **evidence.to_json(), "channel_fit": fit}
         word |= {} if within is None else {"corridor": within.to_json()}
         write_json(json_file, {**word, **found.to_json(), **_gains_to_json(best, why_no_gain)})
 

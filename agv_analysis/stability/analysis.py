@@ -184,12 +184,10 @@ class Analysis(Observations):
     def to_json(self) -> dict[str, Any]:
         """The figures by name, as `Observations.to_json`."""
         values = {name: value for found in self.judgements.values() for name, value in found.values.items()}
-        link = self.evidence.link
         return {
             **super().to_json(),
             **values,
-            "confidence": self.evidence.confidence,
-            **({} if link is None else link.to_json()),
+            **self.evidence.to_json(),
             "driven": None if self.evidence.driven is None else self.evidence.driven.to_json(),
             **self.verdict.to_json(),
             "margin": self.verdict.margin,

@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence
 from agv_analysis.stability.driven_commands import DrivenCommands
@@ -126,6 +127,18 @@ class Evidence:
     def confidence(self) -> float | None:
         """Probability of a stable loop, given the losses that were seen; None where it was not asked."""
         return self.probability_stable if self.growth is not None or self.late_by is not None else None
+
+    def to_json(self) -> dict[str, Any]:
+        """How sure the word is, by name: a growth that is known has an interval without width."""
+        if self.link is not None:
+            return self.link.to_json()
+        is_known = self.growth is not None and math.isfinite(self.growth) and self.probability_stable in (0.0, 1.0)
+        return {
+            "confidence": self.confidence,
+            "growth_interval": [self.growth, self.growth] if is_known else None,
+            "record_seconds_more": None,
+            "stationarity": None,
+        }
 
 
 def decide(evidence: Evidence) -> Verdict:

@@ -133,6 +133,11 @@ def test_the_command(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) ->
     assert said.count("They disagree:") == len(found["disagreements"]) >= 2
     assert found["best_kx"]["almost_sure"] > 0.0
     assert "integer" in found["best_kx"]["almost_sure_reason"]
+    assert (found["verdict"], found["confidence"], found["feasible"]) == ("mean-square", 1.0, True)
+    growth = found["uplink"]["mean_square_growth"]
+    assert found["growth_interval"] == pytest.approx([growth, growth], rel=1e-6)
+    unknown = {"record_seconds_more", "stationarity", "channel_fit"}  # of a channel that is known
+    assert [found[name] for name in sorted(unknown)] == [None] * 3
 
 
 def test_a_trace_has_no_best_gain_and_says_why(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
@@ -148,6 +153,8 @@ def test_a_trace_has_no_best_gain_and_says_why(agv_ncs: Callable[..., tuple[int,
     assert "trace" in found["best_kx_reason"]
     assert "closed form" in found["burst_max"]["mean_square_reason"]
     assert found["n_max"]["bursts"] == 14
+    assert found["stationarity"] is not None
+    assert found["channel_fit"]["goodness"].keys() >= {"fits"}
 
 
 def test_a_trace_is_one_run_whatever_the_seed(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
