@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from agv_analysis.corridor import outer_tube as tubes
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.leaving import Leaving, leaving
 from agv_analysis.corridor.outage_sequences import WorstSequence, largest_n
+from agv_analysis.corridor.outer_tube import Tube, applies_to, with_remainder
 from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, single_outage
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.link.channel_fit import Estimate
@@ -40,6 +42,13 @@ class Corridor:
     """Largest n for which no sequence of outages of up to n slots was found that leaves; None: with all that were
     tried."""
     n_any_reason: str
+    n_any_proved: int | None
+    """Largest n for which a tube about the loss-free motion stays inside, whatever outages of up to n slots come: that
+    of the linear loop, see `outer_tube`; None: not computed, `tube_reason` says why."""
+    tube: Tube | None
+    covering: Tube | None
+    """As `tube`, with what is of second order covered as well; None where none was found that stays inside."""
+    tube_reason: str
     leaving: Leaving
     lap_slots: int
     """Slots of a lap."""
@@ -62,6 +71,7 @@ class Corridor:
         else:
             yield "Longest single outage", self._single(self.single)
             yield "Any outages up to n", self._any()
+            yield "The same, proved", self._proved()
         yield "Probability to leave", self._probability()
         yield "Mean time to leave", _time(self.leaving.mean_time)
 
@@ -80,6 +90,14 @@ class Corridor:
         if self.n_any < 0:
             return "none: the AGV is outside without any"
         return f"no sequence found that leaves up to {self.n_any} slots; {self.n_any_reason}"
+
+    def _proved(self) -> str:
+        if self.tube is None:
+            return f"no n ({self.tube_reason})" if self.n_any_proved is None else "not even without outages"
+        off = f"at most {self.tube.deviation:.3g} m off, by the linear loop"
+        if self.covering is not None:
+            return f"{self.n_any_proved} slots: {off}, {self.covering.deviation:.3g} m with what is of second order"
+        return f"{self.n_any_proved} slots: {off}; what is of second order could not be covered"
 
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
@@ -102,6 +120,10 @@ class Corridor:
             "worst_sequence": None if sequence is None else {
                 "outages": sequence.lengths, "step": sequence.step, "deviation": _finite(sequence.deviation),
             },
+            "n_any_proved": self.n_any_proved,
+            "n_any_proved_reason": self.tube_reason or None,
+            "tube_deviation": None if self.tube is None else self.tube.deviation,
+            "tube_deviation_second_order": None if self.covering is None else self.covering.deviation,
             **_estimates("p_lap", found.p_lap),
             **_estimates("p_hour", found.p_hour),
             **_estimates("mean_time_s", found.mean_time),
@@ -128,6 +150,7 @@ def corridor(
     if widths is None:
         return None
     loop, single, sequence, n_any, why, reason = LapLoop(scenario, widths), None, None, None, "", ""
+    proved, tube, covering, why_no_tube = None, None, None, ""
     if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
         reason = "messages take time or depend on the place, so that there are not outages alone"
     elif not math.isfinite(loop.loss_free_share):
@@ -137,18 +160,21 @@ def corridor(
         single = single_outage(loop)
         progress("sequences of outages")
         n_any, sequence, why = _any_outages(loop, single)
+        progress("a tube for any outages")
+        proved, tube, covering, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
     progress("laps")
     found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"))
     return Corridor(
-        widths, loop.ts, single, sequence, n_any, why, found, loop.steps, reason, tuple(_notes(loop, single))
-    )
+        widths, loop.ts, single, sequence, n_any, why, proved, tube, covering, why_no_tube, found, loop.steps, reason,
+        tuple(_notes(loop, single)),
+    )  # fmt: skip
 
 
 def _any_outages(loop: LapLoop, single: SingleOutage) -> tuple[int | None, WorstSequence | None, str]:
     """Largest n at which no sequence was found that leaves, the worst sequence, and why it is that n."""
     if single.n == -1:
         return -1, None, "the AGV is outside without any"
-    longest = _LONGEST_ANY if single.n is None else min(single.n, _LONGEST_ANY)
+    longest = _longest_any(single)
     growing = _growing(loop, longest)
     n, sequence = largest_n(loop, longest if growing is None else min(longest, growing - 1))
     if growing is not None and n == growing - 1:
@@ -158,6 +184,22 @@ def _any_outages(loop: LapLoop, single: SingleOutage) -> tuple[int | None, Worst
     if n == single.n:
         return n, sequence, "no more than of a single one"
     return n, sequence, f"outages of {_turns(sequence.lengths)} slots leave"
+
+
+def _longest_any(single: SingleOutage) -> int:
+    return _LONGEST_ANY if single.n is None else min(single.n, _LONGEST_ANY)
+
+
+def _tubes(loop: LapLoop, longest: int) -> tuple[int | None, Tube | None, Tube | None, str]:
+    """The largest n that is proved, its tube, that with the second order, and why there is none."""
+    try:
+        linear = loop_on_lap(loop.scenario)
+    except NoNominalMotionError as error:
+        return None, None, None, str(error)
+    if not applies_to(linear):
+        return None, None, None, "computed for loops without states beside the pose, on a track that is driven"
+    n, tube = tubes.largest_n(loop, linear, longest)
+    return n, tube, None if tube is None else with_remainder(loop, linear, tube), ""
 
 
 def _turns(lengths: list[int]) -> str:

@@ -44,15 +44,14 @@ class Plan(NamedTuple):
     """Steps up to and with the last loss: before it no excursion is over."""
     limit: float
     """Share of the corridor at which an excursion ends, inf: at none."""
-    offset: tuple[float, float, float]
-    """How the AGV is displaced when it begins, in its own frame [m, m, rad]."""
 
 
 def excursions(
-    reference: Rows, inputs: RunInputs, widths: Widths, plan: Plan, found: Floats, paths: Floats
+    reference: Rows, inputs: RunInputs, widths: Widths, plan: Plan, offsets: Rows, found: Floats, paths: Floats
 ) -> None:  # fmt: skip
     """Drive them; excursion s begins at step plan.first + s plan.every, with the reception of a pose.
 
+    Its AGV is displaced by offsets[s], in its own frame [m, m, rad]; `offsets` without rows: none is.
     Its slot i has the outcome inputs.lost[i]. `found`, shape (S, COLUMNS), is filled in, and the first rows of `paths`,
     shape (S, steps, 3): x_e, y_e, theta_e of the AGV before each slot. If `paths` has no rows nothing is kept.
     `reference` has as many rows as are driven and looked ahead to.
@@ -62,7 +61,9 @@ def excursions(
         base = loss_free(base, reference, k, inputs)
     for s in range(len(found)):
         k = plan.first + s * plan.every
-        run = displaced(base, plan.offset)
+        run = base
+        if len(offsets) > 0:
+            run = displaced(base, offsets[s][0], offsets[s][1], offsets[s][2])
         largest, at, along_there, across_there = -1.0, 0, 0.0, 0.0
         for i in range(len(inputs.lost) + 1):
             now = reference_at(reference, k + i)
@@ -96,9 +97,9 @@ def loss_free(loop: Loop, reference: Rows, k: int, inputs: RunInputs) -> Loop:
     return loop
 
 
-def displaced(loop: Loop, offset: tuple[float, float, float]) -> Loop:
-    """The loop with its AGV elsewhere, by an offset in its own frame [m, m, rad]."""
+def displaced(loop: Loop, ahead: float, left: float, turned: float) -> Loop:
+    """The loop with its AGV elsewhere, by so much in its own frame [m, m, rad]."""
     now = loop.motion
-    dx, dy, theta = tracking_error(offset[0], offset[1], offset[2], 0.0, 0.0, -now.theta)
+    dx, dy, theta = tracking_error(ahead, left, turned, 0.0, 0.0, -now.theta)
     motion = Motion(now.x + dx, now.y + dy, theta, now.v, now.w, now.a, now.states)
     return Loop(motion, loop.edge, loop.command, loop.plan)

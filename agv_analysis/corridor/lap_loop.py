@@ -97,25 +97,28 @@ class LapLoop:
 
     def excursions(
         self, outcomes: Outcomes, every: int = 1, limit: float = math.inf,
-        offset: tuple[float, float, float] = (0.0, 0.0, 0.0), kept: int = 0,
+        offsets: Floats | None = None, kept: int = 0, follow: bool = True,
     ) -> tuple[Excursions, Floats]:  # fmt: skip
         """Excursions under the same outcomes, True where lost, from every so many steps of a lap.
 
-        They end at `limit`, a share of the corridor, or when they are over. The first outcome is a reception, after the
-        last one all are. Also the errors x_e, y_e, theta_e [m, m, rad] before the first `kept` slots of each, shape
-        (S, kept, 3).
+        They end at `limit`, a share of the corridor, when they are over, or, if they are not to be followed, with the
+        last outcome. The first outcome is a reception, after the last one all are. The AGVs are displaced by `offsets`,
+        shape (S, 3), in their own frames [m, m, rad]. Also the errors x_e, y_e, theta_e [m, m, rad] before the first
+        `kept` slots of each, shape (S, kept, 3).
         """
-        lost = np.concatenate((outcomes, np.zeros(self.recovery, dtype=np.bool_)))
-        losses = int(np.flatnonzero(lost).max(initial=0))
+        lost = np.concatenate((outcomes, np.zeros(self.recovery if follow else 0, dtype=np.bool_)))
+        shift = np.zeros((0, 3)) if offsets is None else offsets
+        losses = int(np.flatnonzero(lost).max(initial=0)) if follow else len(lost)
         steps = np.arange(0, self.steps, every)
         found, paths = np.full((len(steps), COLUMNS), math.nan), np.full((len(steps), kept, 3), math.nan)
         reference = numbers(self.reference(self.steps + int(steps[-1]) + every + len(lost) + 1))
 
         def drive(part: NDArray[np.int64]) -> None:
             first = self.steps + int(steps[part[0]])  # after a lap the loop has settled
-            plan, rows = Plan(first, every, losses, limit, offset), slice(int(part[0]), int(part[-1]) + 1)
+            plan, rows = Plan(first, every, losses, limit), slice(int(part[0]), int(part[-1]) + 1)
             run_parts(
-                excursions, self._parts, reference, self.inputs(lost), self.widths, plan, found[rows], paths[rows]
+                excursions, self._parts, reference, self.inputs(lost), self.widths, plan, numbers(shift[rows]),
+                found[rows], paths[rows],
             )  # fmt: skip
 
         parts = np.array_split(np.arange(len(steps)), min(cores(), max(1, len(steps) // _AT_ONCE)))

@@ -1,0 +1,338 @@
+"""A tube about the loss-free motion that no sequence of outages of up to n slots leaves.
+
+With z the deviation of the errors (x_e, y_e, theta_e) from those of the loss-free motion, an outage makes of a state at
+a reception
+
+    z(k+i) = M_i(k) z(k) + b_i(k),    i = 1 .. n + 1,
+
+where M_i is the map of the linear loop (`reception_maps`), and b_i what the outage does to an AGV without deviation:
+the bias of `hold`, or what the model of `predict` does not know. Any of these states may be the next reception. So the
+support function V_k(d) = sup d' z(k), over all sequences, obeys
+
+    V_k(d) = max over i of  d' b_i(k-i) + V_{k-i}(M_i(k-i)' d).
+
+It is bounded from above on a few directions d: both along x_e, and a polygon in the plane of y_e and theta_e. Any
+other direction is a sum of three of them with positive weights, and V of a sum is at most the sum. Bounds of a lap that
+are no larger at its end than at its beginning hold for ever.
+
+This proves the tube for the linear loop with the b_i of the nonlinear one. What is of second order, the `remainder`,
+can be added to each b_i as a box. Its size is measured on the nonlinear loop, from the corners of the very tube, at
+places of the lap, and times a factor: then it is covered, but not proved.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from agv_analysis.compiled import compiled
+from agv_analysis.corridor.lap_loop import LapLoop, outage
+from agv_analysis.corridor.widths import Widths
+from agv_analysis.run import Floats
+from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.products import assign, multiply
+from agv_analysis.stability.reception_maps import burst_maps
+
+_SIDES, _SIDES_OF_LONG = 32, 16
+"""Directions of the polygon, fewer for outages that are LONG; multiples of 4, so that those along y_e and theta_e are
+among them."""
+
+LONG = 100
+"""Slots from which on an outage is long: tubes then take seconds, and what is of second order is not measured."""
+
+_FARTHER = 3.0
+"""Multiple of the corridor's width up to which a tube is followed, to know how much too wide it is."""
+
+_ERRORS = 3
+
+_WARM_UP = 4000
+"""Steps after which what the tube was before is forgotten; at the end it is tested that it was."""
+
+_SLACK = 1e-6
+"""By so much the tube is widened before the lap that must give it back."""
+
+_LAPS = 4
+"""Laps after which a tube that still grows counts as one without an end."""
+
+_PARTS = 100
+"""Parts of the lap, of each of which the remainder is measured where it begins."""
+
+_ROUNDS, _MORE = 12, 1.1
+"""How often the tube is widened by the remainder that it has, and by how much more than that."""
+
+_ROUNDING = 1e-9
+"""Remainder that is none [m, m, rad]."""
+
+_REMAINDER_TIMES = 1.2
+"""Factor on the largest remainder that was measured."""
+
+_LARGEST_BIAS = 3_000_000
+"""Rows of the b_i that are computed; in a longer lap those between are interpolated."""
+
+
+class Template(NamedTuple):
+    """Directions in which the tube is bounded: (1, 0, 0), (-1, 0, 0), then the polygon's."""
+
+    directions: Floats
+    """Shape (2 + sides, 3)."""
+    lever: float
+    """How many metres a radian counts as in the polygon's plane."""
+
+    @property
+    def quarter(self) -> int:
+        """A quarter of the polygon's sides."""
+        return (len(self.directions) - 2) // 4
+
+
+@dataclass(frozen=True)
+class Tube:
+    """Bounds of the deviation under any outages of up to n slots, by step of the lap."""
+
+    n: int
+    bounds: Floats
+    """V_k of the template's directions, shape (R, 2 + sides); R is N, or 1 where the loop is the same at every step."""
+    template: Template
+    nominal: Floats
+    """Errors of the loss-free motion, shape (R, 3)."""
+    remainder: Floats
+    """Boxes that are added to the b_i, by part of the lap, shape (parts, n + 2, 3)."""
+    share: Floats
+    """Share of the corridor that the tube uses at most, by step, shape (R,)."""
+    distance: Floats
+    """Largest distance from the reference in it [m], by step, shape (R,)."""
+
+    @property
+    def deviation(self) -> float:
+        """The same over the lap."""
+        return float(self.distance.max())
+
+    @property
+    def largest_share(self) -> float:
+        """The same over the lap."""
+        return float(self.share.max())
+
+
+def template_of(linear: LinearLoop, sides: int = _SIDES) -> Template:
+    """Directions for a loop; the lever makes a turn of its error across the track nearly a circle."""
+    k = 0 if linear.is_constant else int(np.argmax(np.abs(linear.v_r)))
+    step = linear.F[k].copy()
+    step[:, : linear.outputs] += linear.G[k]
+    ratio = -step[1, 2] / step[2, 1] if step[2, 1] != 0.0 else 1.0
+    lever = math.sqrt(ratio) if ratio > 0.0 else 1.0
+    angles = 2.0 * np.pi * np.arange(sides) / sides
+    polygon = np.column_stack((np.zeros(sides), np.cos(angles), lever * np.sin(angles)))
+    return Template(np.concatenate(([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], polygon)), lever)
+
+
+def applies_to(linear: LinearLoop) -> bool:
+    """Are the errors all the states of the loop?"""
+    return linear.size == linear.outputs == _ERRORS
+
+
+def outer_tube(loop: LapLoop, linear: LinearLoop, n: int) -> Tube | None:
+    """The tube for outages of up to `n` slots; None where it grows out of the corridor, or for ever."""
+    bias, nominal = biases(loop, linear, n)
+    if not np.isfinite(bias).all():
+        return None
+    return _tube(loop, linear, n, bias, nominal, np.zeros((1, n + 2, _ERRORS)))
+
+
+def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tube | None]:
+    """(largest n up to `longest` whose tube stays in the corridor, the tube); -1 if not even that without outages does.
+
+    A tube holds those of fewer slots. The n of outages that are LONG is the largest to a fiftieth of it.
+    """
+    if linear.is_exact:  # an outage leaves nothing, however long
+        return longest, outer_tube(loop, linear, 0)
+    inside, outside, tube, attempt = -1, longest + 1, None, longest
+    while outside - inside > max(1, inside // 50):
+        found = outer_tube(loop, linear, attempt)
+        middle = 0
+        if found is not None and found.largest_share <= 1.0:
+            inside, tube = attempt, found
+        else:
+            outside = attempt
+            nearer = 0.99 if attempt > LONG else 1.0
+            middle = 0 if found is None else int(nearer * attempt / math.sqrt(found.largest_share))
+        attempt = middle if inside < middle < outside else (inside + outside) // 2
+    return inside, tube
+
+
+def with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube) -> Tube | None:
+    """A tube that covers, too, what is of second order in it; None where none was found that stays in the corridor."""
+    if tube.n > LONG:
+        return None
+    bias, parts = biases(loop, linear, tube.n)[0], 1 if linear.is_constant else min(_PARTS, loop.steps)
+    remainder = np.zeros((parts, tube.n + 2, _ERRORS))
+    found: Tube | None = replace(tube, remainder=remainder)
+    for _ in range(_ROUNDS):
+        if found is None or found.largest_share > 1.0:
+            return None
+        needed = _REMAINDER_TIMES * measured_remainder(loop, linear, found, bias)
+        if (needed <= remainder + _ROUNDING).all():
+            return found
+        remainder = np.maximum(remainder, _MORE * needed)
+        found = _tube(loop, linear, tube.n, bias, tube.nominal, remainder)
+    return None
+
+
+def biases(loop: LapLoop, linear: LinearLoop, n: int) -> tuple[Floats, Floats]:
+    """b_i, shape (R, n + 2, 3), row i that of i slots after a reception, and the loss-free errors, shape (R, 3)."""
+    every = loop.steps if linear.is_constant else max(1, math.ceil(loop.steps * (n + 2) / _LARGEST_BIAS))
+    _, free = loop.excursions(np.zeros(n + 2, dtype=np.bool_), every, kept=n + 2, follow=False)
+    _, lost = loop.excursions(outage(n), every, kept=n + 2, follow=False)
+    bias, nominal = lost - free, free[:, 0]
+    if every > 1 and not linear.is_constant:
+        bias, nominal = (_between(rows, every, loop.steps) for rows in (bias, nominal))
+    return np.ascontiguousarray(bias), np.ascontiguousarray(nominal)
+
+
+def _between(rows: Floats, every: int, steps: int) -> Floats:
+    """Rows of every so many steps of a lap, linearly interpolated to all of them."""
+    k = np.arange(steps)
+    before = np.minimum(k // every, len(rows) - 1)
+    after = (before + 1) % len(rows)
+    width = np.where(before + 1 < len(rows), every, steps - (len(rows) - 1) * every)
+    share = ((k - before * every) / width).reshape(-1, *(1,) * (rows.ndim - 1))
+    return np.asarray((1.0 - share) * rows[before] + share * rows[after])
+
+
+def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Floats, nominal: Floats, remainder: Floats) -> Tube | None:
+    """The tube with a given remainder; None where it grows out of the corridor, or for ever."""
+    rows, template = len(bias), template_of(linear, _SIDES_OF_LONG if n > LONG else _SIDES)
+    lap = -(-max(rows, n + 2, _WARM_UP) // rows) * rows  # in whole turns of the rows, longer than any memory
+    widths = loop.widths
+    limit = _FARTHER * min(widths.distance, max(widths.along, widths.across))
+    window = np.zeros((n + 2, len(template.directions)))
+    bounds = np.empty((lap, len(template.directions)))
+    drive = compiled(_push)
+    arguments = linear.F, linear.G, linear.H, linear.K, bias, remainder, template.directions, template.lever
+    begun = np.empty((_WARM_UP, len(template.directions)))
+    if not drive(*arguments, -_WARM_UP % rows, window, begun, limit):
+        return None
+    for _ in range(_LAPS):
+        window += _SLACK * np.where(np.isfinite(window), np.abs(window) + 1e-6, 0.0)
+        before = window.copy()
+        if not drive(*arguments, 0, window, bounds, limit):
+            return None
+        if (window <= before).all():
+            of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)
+            return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
+    return None
+
+
+def _push(
+    F: Floats, G: Floats, H: Floats | None, K: Floats | None, bias: Floats, remainder: Floats, directions: Floats,
+    lever: float, first: int, window: Floats, bounds: Floats, limit: float,
+) -> bool:  # fmt: skip
+    """Drive the bounds on: row j of `bounds` is that of step first + j; False where one leaves the limit.
+
+    `window`, row i: the bounds that are known of the state i steps on, all of them for i = 0; in place.
+    """
+    count, longest, sides = directions.shape[0], window.shape[0] - 1, directions.shape[0] - 2
+    size = F.shape[1]
+    M, M_next = np.empty((size, size)), np.empty((size, size))
+    N, N_next = np.empty((size, size)), np.empty((size, size))
+    sine = math.sin(2.0 * math.pi / sides)
+    sectors = np.zeros(count, dtype=np.int64)
+    for j in range(bounds.shape[0]):
+        for i in range(count):
+            bounds[j, i] = window[0, i]
+        if not (max(window[0, 0], window[0, 1]) <= limit and max(window[0, 2], window[0, 2 + sides // 2]) <= limit):
+            return False
+        for i in range(size):
+            for p in range(size):
+                M[i, p] = N[i, p] = 1.0 if i == p else 0.0
+        for i in range(count):
+            sectors[i] = i - 2 if i >= 2 else 0
+        for length in range(1, longest + 1):
+            row = (first + j + length - 1) % F.shape[0]
+            multiply(F[row], M, False, M_next, False)
+            multiply(G[row], N, False, M_next, True)
+            if H is not None:
+                multiply(H[row], N, False, N_next, False)
+                if K is not None:
+                    multiply(K[row], M, False, N_next, True)
+                assign(N_next, N)
+            assign(M_next, M)
+            begun = (first + j) % bias.shape[0]
+            part = begun * remainder.shape[0] // bias.shape[0]
+            for i in range(count):
+                x, y, theta = directions[i, 0], directions[i, 1], directions[i, 2]
+                p_x = M[0, 0] * x + M[1, 0] * y + M[2, 0] * theta
+                p_y = M[0, 1] * x + M[1, 1] * y + M[2, 1] * theta
+                p_t = (M[0, 2] * x + M[1, 2] * y + M[2, 2] * theta) / lever
+                value = p_x * bounds[j, 0] if p_x >= 0.0 else -p_x * bounds[j, 1]
+                side = sectors[i]
+                # The sector that holds (p_y, p_t), searched for from where it was after one slot less.
+                for _ in range(sides):
+                    ahead = side + 1 if side + 1 < sides else 0
+                    c_y, c_t = directions[2 + side, 1], directions[2 + side, 2] / lever
+                    a_y, a_t = directions[2 + ahead, 1], directions[2 + ahead, 2] / lever
+                    left, right = c_y * p_t - c_t * p_y, p_y * a_t - p_t * a_y
+                    if left >= 0.0 and right >= 0.0:
+                        value += (right * bounds[j, 2 + side] + left * bounds[j, 2 + ahead]) / sine
+                        sectors[i] = side
+                        break
+                    if left < 0.0 and c_y * p_y + c_t * p_t > 0.0:
+                        side = side - 1 if side > 0 else sides - 1
+                    else:
+                        side = ahead
+                value += bias[begun, length, 0] * x + bias[begun, length, 1] * y + bias[begun, length, 2] * theta
+                value += remainder[part, length, 0] * abs(x) + remainder[part, length, 1] * abs(y)
+                value += remainder[part, length, 2] * abs(theta)
+                if value > window[length, i]:
+                    window[length, i] = value
+        for length in range(longest):
+            for i in range(count):
+                window[length, i] = window[length + 1, i]
+        for i in range(count):
+            window[longest, i] = -math.inf
+    return True
+
+
+def _extent(bounds: Floats, template: Template, nominal: Floats, widths: Widths) -> tuple[Floats, Floats]:
+    """Share of the corridor that the tube uses at most at each step, and the largest distance [m]; shapes (R,)."""
+    quarter = template.quarter
+    x = np.maximum(bounds[:, 0] + nominal[:, 0], bounds[:, 1] - nominal[:, 0])
+    y = np.maximum(bounds[:, 2] + nominal[:, 1], bounds[:, 2 + 2 * quarter] - nominal[:, 1])
+    turned = np.maximum(bounds[:, 2 + quarter], bounds[:, 2 + 3 * quarter]) / template.lever + np.abs(nominal[:, 2])
+    along, across = x + turned * y, y + turned * x  # the errors are seen from the AGV, the corridor from its reference
+    distance = np.hypot(x, y)
+    return np.maximum(distance / widths.distance, np.maximum(along / widths.along, across / widths.across)), distance
+
+
+def measured_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Floats) -> Floats:
+    """Largest difference of the nonlinear loop from M_i z + b_i, from the corners of a tube, by part of the lap.
+
+    Shape (parts, n + 2, 3). Of each part it is measured from where it begins, and holds for it and the one before.
+    """
+    parts, length, quarter = len(tube.remainder), tube.n + 2, tube.template.quarter
+    every = -(-loop.steps // parts)
+    steps = np.arange(0, loop.steps, every)
+    widest = np.maximum.reduceat(tube.bounds, np.unique(steps * len(tube.bounds) // loop.steps))
+    widest = np.broadcast_to(widest, (len(steps), widest.shape[1]))
+    pairs = (0, 1, 1.0), (2, 2 + 2 * quarter, 1.0), (2 + quarter, 2 + 3 * quarter, tube.template.lever)
+    ahead, left, turned = (np.stack((widest[:, one], -widest[:, other])) / unit for one, other, unit in pairs)
+    identity = np.broadcast_to(np.eye(_ERRORS), (len(steps), _ERRORS, _ERRORS))
+    maps = np.stack((identity, *burst_maps(linear, length - 1, steps % len(linear.F))))
+    rows, found = steps % len(bias), np.zeros((len(steps), length, _ERRORS))
+    nominal = tube.nominal[(steps[:, None] + np.arange(length)) % len(tube.nominal)]
+    for x, y, theta in itertools.product(ahead, left, turned):
+        offsets = np.column_stack(_placed(x, y, theta))
+        _, paths = loop.excursions(outage(tube.n), every, offsets=offsets, kept=length, follow=False)
+        deviation = paths - nominal
+        apart = deviation - np.einsum("isjk,sk->sij", maps, deviation[:, 0]) - bias[rows]
+        found = np.fmax(found, np.abs(apart))
+    found = np.maximum(found, np.roll(found, -1, axis=0))
+    return found[np.arange(parts) * len(steps) // parts]
+
+
+def _placed(x: Floats, y: Floats, theta: Floats) -> tuple[Floats, Floats, Floats]:
+    """How AGVs on their reference must be displaced, in their own frame, to see it at these errors."""
+    cos, sin = np.cos(theta), np.sin(theta)
+    return -cos * x - sin * y, sin * x - cos * y, -theta
