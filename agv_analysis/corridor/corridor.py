@@ -9,10 +9,11 @@ from typing import Any
 
 from agv_analysis.corridor import outer_tube as tubes
 from agv_analysis.corridor.lap_loop import LapLoop
-from agv_analysis.corridor.leaving import Leaving, leaving
+from agv_analysis.corridor.leaving import Leaving, chain_alone, is_random, leaving
 from agv_analysis.corridor.outage_sequences import WorstSequence, largest_n
 from agv_analysis.corridor.outer_tube import Tube, applies_to, with_remainder
 from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, single_outage
+from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stationary_deviation
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.scenario import Scenario
@@ -49,6 +50,9 @@ class Corridor:
     covering: Tube | None
     """As `tube`, with what is of second order covered as well; None where none was found that stays inside."""
     tube_reason: str
+    stationary: StationaryDeviation | None
+    """Deviation in the long run, by its second moments; None: not computed, `stationary_reason` says why."""
+    stationary_reason: str
     leaving: Leaving
     lap_slots: int
     """Slots of a lap."""
@@ -72,6 +76,7 @@ class Corridor:
             yield "Longest single outage", self._single(self.single)
             yield "Any outages up to n", self._any()
             yield "The same, proved", self._proved()
+        yield "RMS deviation", self._rms()
         yield "Probability to leave", self._probability()
         yield "Mean time to leave", _time(self.leaving.mean_time)
 
@@ -99,6 +104,14 @@ class Corridor:
             return f"{self.n_any_proved} slots: {off}, {self.covering.deviation:.3g} m with what is of second order"
         return f"{self.n_any_proved} slots: {off}; what is of second order could not be covered"
 
+    def _rms(self) -> str:
+        simulated = f"{self.leaving.rms:.3g} m in the simulated laps"
+        if self.stationary is None:
+            return f"{simulated}; not known to first order: {self.stationary_reason}"
+        if not math.isfinite(self.stationary.rms):
+            return f"{simulated}; to first order its mean square does not settle"
+        return f"{self.stationary.rms:.3g} m to first order, {simulated}"
+
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
         return f"{_percent(lap)} a lap, {_percent(hour)} an hour (by {self.leaving.method})"
@@ -124,6 +137,11 @@ class Corridor:
             "n_any_proved_reason": self.tube_reason or None,
             "tube_deviation": None if self.tube is None else self.tube.deviation,
             "tube_deviation_second_order": None if self.covering is None else self.covering.deviation,
+            "rms_deviation": None if self.stationary is None else _finite(self.stationary.rms),
+            "rms_deviation_reason": self.stationary_reason or None,
+            "rms_along": None if self.stationary is None else _finite(self.stationary.rms_along),
+            "rms_across": None if self.stationary is None else _finite(self.stationary.rms_across),
+            "rms_simulated": _finite(found.rms),
             **_estimates("p_lap", found.p_lap),
             **_estimates("p_hour", found.p_hour),
             **_estimates("mean_time_s", found.mean_time),
@@ -165,8 +183,8 @@ def corridor(
     progress("laps")
     found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"))
     return Corridor(
-        widths, loop.ts, single, sequence, n_any, why, proved, tube, covering, why_no_tube, found, loop.steps, reason,
-        tuple(_notes(loop, single)),
+        widths, loop.ts, single, sequence, n_any, why, proved, tube, covering, why_no_tube, *_stationary(loop), found,
+        loop.steps, reason, tuple(_notes(loop, single)),
     )  # fmt: skip
 
 
@@ -200,6 +218,21 @@ def _tubes(loop: LapLoop, longest: int) -> tuple[int | None, Tube | None, Tube |
         return None, None, None, "computed for loops without states beside the pose, on a track that is driven"
     n, tube = tubes.largest_n(loop, linear, longest)
     return n, tube, None if tube is None else with_remainder(loop, linear, tube), ""
+
+
+def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:
+    """The deviation in the long run, or why it is not computed."""
+    chain, scenario = chain_alone(loop.scenario), loop.scenario
+    if not is_random(scenario):
+        return None, "nothing is random"
+    if chain is None:
+        return None, "the uplink is no Markov chain that alone loses messages"
+    if scenario.plant.slip_noise > 0.0:
+        return None, "slip is random"
+    try:
+        return stationary_deviation(loop, loop_on_lap(scenario), chain), ""
+    except NoNominalMotionError as error:
+        return None, str(error)
 
 
 def _turns(lengths: list[int]) -> str:

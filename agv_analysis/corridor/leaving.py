@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,11 +25,14 @@ from agv_analysis.corridor.single_outage import SingleOutage
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.link.markov_channel import Chain, chain_of
 from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.loop import RunInputs, history
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.single import settings_of, simulate
+from agv_plant.channels.registry import TRACE
+from agv_plant.parameters import ChannelParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
 
 LAPS = 200
@@ -46,6 +50,17 @@ _ON_REFERENCE = 1e-3
 """Share of the corridor up to which the loss-free motion is the reference."""
 
 
+class Lap(NamedTuple):
+    """What is kept of a simulated lap."""
+
+    share: float
+    """Largest share of the corridor that it used; inf if it diverged."""
+    steps: int
+    """Steps until the corridor was left, or all."""
+    mean_square: float
+    """Of the distance from the reference [m^2]."""
+
+
 @dataclass(frozen=True)
 class Leaving:
     """How often the corridor is left; each figure with its 95 % interval."""
@@ -59,6 +74,13 @@ class Leaving:
     """How this is known, in words."""
     largest: Floats
     """Largest share of the corridor that each of the simulated laps used, shape (laps,); inf where one diverged."""
+    mean_squares: Floats
+    """Mean square of the distance from the reference in each of them [m^2], shape (laps,)."""
+
+    @property
+    def rms(self) -> float:
+        """RMS deviation of the simulated laps [m]; inf where one diverged."""
+        return float(np.sqrt(self.mean_squares.mean()))
 
 
 def leaving(
@@ -66,35 +88,32 @@ def leaving(
     progress: Callable[[int], None] = lambda done: None,
 ) -> Leaving:  # fmt: skip
     """How often a scenario's loop leaves its corridor. `single`: what one outage does to it, where that is known."""
+    if not is_random(loop.scenario):
+        return _certain(loop, _one_lap(loop))
     laps = laps or max(_FEWEST, min(LAPS, _SLOTS // loop.steps))
-    runs = list(_laps(loop, laps, progress))
-    largest = np.array([found for found, _ in runs])
-    left, driven = int((largest > 1.0).sum()), float(sum(steps for _, steps in runs)) * loop.ts
-    if len(runs) < laps:
-        return _certain(loop, runs[0], largest)
-    share = Estimate.of(left, laps)
-    chain = _chain(loop)
+    driven = list(_laps(loop, laps, progress))
+    left, seconds = sum(lap.share > 1.0 for lap in driven), sum(lap.steps for lap in driven) * loop.ts
+    chain = chain_alone(loop.scenario)
     if left < ENOUGH and chain is not None and single is not None and single.n is not None and single.n >= 0:
         rate = leaving_rate(loop, chain, single.n, loop.scenario.relay.seed)
         if 0.0 < rate.per_slot.value * loop.steps < _RARE:
-            return _of_rate(loop, rate.per_slot, largest, f"importance splitting with {rate.runs} runs")
-    return _of_laps(
-        loop, share, driven / left if left else None, largest, f"{laps} simulated laps, {left} of which left it"
-    )
+            return _of_rate(loop, rate.per_slot, driven, f"importance splitting with {rate.runs} runs")
+    method = f"{laps} simulated laps, {left} of which left it"
+    return _of_laps(loop, Estimate.of(left, laps), seconds / left if left else None, driven, method)
 
 
 _RARE = 0.2
 """Expected number of times a lap up to which they count as independent of each other."""
 
 
-def _of_laps(loop: LapLoop, p: Estimate, mean: float | None, largest: Floats, method: str) -> Leaving:
+def _of_laps(loop: LapLoop, p: Estimate, mean: float | None, driven: list[Lap], method: str) -> Leaving:
     lap = loop.steps * loop.ts
     per_hour = Estimate(*(_within(value, HOUR / lap) for value in (p.value, p.low, p.high)))
     if mean is None:
         low = -lap / math.log1p(-p.high)
-        return Leaving(p, per_hour, Estimate(math.inf, low, math.inf), method, largest)
+        return Leaving(p, per_hour, Estimate(math.inf, low, math.inf), method, *_of_each(driven))
     high = mean * p.value / p.low if p.low > 0.0 else math.inf
-    return Leaving(p, per_hour, Estimate.about(mean, mean * p.value / p.high, high), method, largest)
+    return Leaving(p, per_hour, Estimate.about(mean, mean * p.value / p.high, high), method, *_of_each(driven))
 
 
 def _within(p: float, times: float) -> float:
@@ -102,60 +121,74 @@ def _within(p: float, times: float) -> float:
     return -math.expm1(times * math.log1p(-p)) if p < 1.0 else 1.0
 
 
-def _of_rate(loop: LapLoop, rate: Estimate, largest: Floats, method: str) -> Leaving:
+def _of_rate(loop: LapLoop, rate: Estimate, driven: list[Lap], method: str) -> Leaving:
     lap, hour, ends = loop.steps, HOUR / loop.ts, (rate.value, rate.low, rate.high)
     p_lap, p_hour = (Estimate(*(-math.expm1(-value * slots) for value in ends)) for slots in (lap, hour))
     times = [loop.ts / value if value > 0.0 else math.inf for value in (rate.value, rate.high, rate.low)]
-    return Leaving(p_lap, p_hour, Estimate(*times), method, largest)
+    return Leaving(p_lap, p_hour, Estimate(*times), method, *_of_each(driven))
 
 
-def _certain(loop: LapLoop, run: tuple[float, int], largest: Floats) -> Leaving:
+def _of_each(driven: list[Lap]) -> tuple[Floats, Floats]:
+    return np.array([lap.share for lap in driven]), np.array([lap.mean_square for lap in driven])
+
+
+def _certain(loop: LapLoop, lap: Lap) -> Leaving:
     """Nothing is random: one lap says it all."""
-    leaves = float(run[0] > 1.0)
+    leaves = float(lap.share > 1.0)
     p = Estimate(leaves, leaves, leaves)
-    mean = Estimate(*(run[1] * loop.ts,) * 3) if leaves else None
-    return Leaving(p, p, mean, "nothing is random: one lap shows it", largest)
+    mean = Estimate(*(lap.steps * loop.ts,) * 3) if leaves else None
+    return Leaving(p, p, mean, "one lap, since nothing is random", *_of_each([lap]))
 
 
-def _chain(loop: LapLoop) -> Chain | None:
-    """The uplink as a chain, where it alone loses messages and none comes late."""
-    uplink, downlink = loop.scenario.relay.uplink, loop.scenario.relay.downlink
+def chain_alone(scenario: Scenario) -> Chain | None:
+    """The uplink as a chain, where it alone loses messages, some but not all, and none comes late."""
+    uplink, downlink = scenario.relay.uplink, scenario.relay.downlink
     is_alone = uplink.is_direct and downlink.is_direct and downlink.model == "perfect" and not downlink.schedule
     chain = chain_of(uplink) if is_alone else None
     return chain if chain is not None and 0.0 < chain.loss_rate < 1.0 else None
 
 
-def _laps(loop: LapLoop, laps: int, progress: Callable[[int], None]) -> Iterator[tuple[float, int]]:
-    """Of each lap the largest share of the corridor and the steps until it was left; of one lap if all are equal."""
-    scenario, drive = loop.scenario, _direct_lap
-    if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
-        drive = _simulated_lap
-    loop.reference(2 * loop.steps)
-    skipped = 0 if loop.loss_free_share < _ON_REFERENCE else loop.steps
-    first = scenario.relay.seed
-    if not _is_random(loop):
-        yield drive(loop, first, skipped)
-        return
-    with ThreadPoolExecutor(cores()) as pool:
-        for done, found in enumerate(pool.map(lambda i: drive(loop, first + i, skipped), range(laps)), start=1):
-            progress(done)
-            yield found
-
-
-def _is_random(loop: LapLoop) -> bool:
+def is_random(scenario: Scenario) -> bool:
     """Do noise, slip or a link depend on the seed?"""
-    plant, relay = loop.scenario.plant, loop.scenario.relay
-    links = (relay.uplink, relay.downlink)
-    if plant.is_noisy or plant.slip_noise > 0.0 or any(link.is_placed or link.jitter > 0.0 for link in links):
+    plant, relay = scenario.plant, scenario.relay
+    return plant.is_noisy or plant.slip_noise > 0.0 or any(map(_is_drawn, (relay.uplink, relay.downlink)))
+
+
+def _is_drawn(link: ChannelParameters) -> bool:
+    """Are outcomes or delays of a link random?"""
+    if link.is_placed or link.jitter > 0.0:
         return True
-    one, other = (ChannelRealisation(relay.seed + i, loop.steps, loop.ts) for i in range(2))
-    return any(
-        not np.array_equal(one.outcomes(link, name), other.outcomes(link, name))
-        for name, link in (("uplink", relay.uplink), ("downlink", relay.downlink))
-    )
+    chain = chain_of(link)
+    if chain is None:
+        return link.model not in (TRACE, "perfect", "burst")
+    chances = np.concatenate((chain.transition.ravel(), chain.delivery))
+    return bool(((chances > 0.0) & (chances < 1.0)).any())
 
 
-def _direct_lap(loop: LapLoop, seed: int, skipped: int) -> tuple[float, int]:
+def _laps(loop: LapLoop, laps: int, progress: Callable[[int], None]) -> Iterator[Lap]:
+    """Laps under the seeds from relay.seed on."""
+    drive, skipped = _prepared(loop)
+    with ThreadPoolExecutor(cores()) as pool:
+        found = pool.map(lambda i: drive(loop, loop.scenario.relay.seed + i, skipped), range(laps))
+        for done, lap in enumerate(found, start=1):
+            progress(done)
+            yield lap
+
+
+def _one_lap(loop: LapLoop) -> Lap:
+    drive, skipped = _prepared(loop)
+    return drive(loop, loop.scenario.relay.seed, skipped)
+
+
+def _prepared(loop: LapLoop) -> tuple[Callable[[LapLoop, int, int], Lap], int]:
+    """How a lap is driven, and how many steps of it are not looked at."""
+    relay = loop.scenario.relay
+    loop.reference(2 * loop.steps)  # before threads ask for it
+    is_direct = relay.uplink.is_direct and relay.downlink.is_direct
+    return _direct_lap if is_direct else _simulated_lap, 0 if loop.loss_free_share < _ON_REFERENCE else loop.steps
+
+
+def _direct_lap(loop: LapLoop, seed: int, skipped: int) -> Lap:
     scenario, steps = loop.scenario, skipped + loop.steps
     plant, relay, drawn = scenario.plant, scenario.relay, ChannelRealisation(seed, steps, loop.ts)
     inputs = RunInputs(
@@ -167,10 +200,10 @@ def _direct_lap(loop: LapLoop, seed: int, skipped: int) -> tuple[float, int]:
     rows, n_ul = np.full((steps, 8), math.nan), np.empty(steps, dtype=np.int64)
     reference = loop.reference(2 * loop.steps)
     run_parts(history, replacements_of(scenario), numbers(reference), inputs, rows, n_ul)
-    return _largest(loop, rows[skipped:, :3], reference[skipped:steps])
+    return _seen(loop, rows[skipped:, :3], reference[skipped:steps])
 
 
-def _simulated_lap(loop: LapLoop, seed: int, skipped: int) -> tuple[float, int]:
+def _simulated_lap(loop: LapLoop, seed: int, skipped: int) -> Lap:
     scenario = loop.scenario
     plant = replace(
         scenario.plant, seed=seed, initial_pose=scenario.error_detector.track_start,
@@ -180,10 +213,13 @@ def _simulated_lap(loop: LapLoop, seed: int, skipped: int) -> tuple[float, int]:
     pose = np.full((skipped + loop.steps, 3), math.nan)
     pose[: len(run)] = run.pose
     reference = loop.reference(2 * loop.steps)
-    return _largest(loop, pose[skipped:], reference[skipped : len(pose)])
+    return _seen(loop, pose[skipped:], reference[skipped : len(pose)])
 
 
-def _largest(loop: LapLoop, pose: Floats, reference: Floats) -> tuple[float, int]:
+def _seen(loop: LapLoop, pose: Floats, reference: Floats) -> Lap:
     shares = path_shares(pose, reference, loop.widths)
     outside = np.flatnonzero(shares > 1.0)
-    return float(shares.max()), int(outside[0]) if len(outside) else len(shares)
+    with np.errstate(invalid="ignore", over="ignore"):
+        square = float(np.square(pose[:, :2] - reference[:, :2]).sum(axis=1).mean())
+    steps = int(outside[0]) if len(outside) else len(shares)
+    return Lap(float(shares.max()), steps, square if math.isfinite(square) else math.inf)

@@ -148,7 +148,8 @@ def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tub
     """
     if linear.is_exact:  # an outage leaves nothing, however long
         return longest, outer_tube(loop, linear, 0)
-    inside, outside, tube, attempt = -1, longest + 1, None, longest
+    inside, outside, tube = -1, longest + 1, None
+    attempt = int(0.99 * longest) if longest > LONG else longest
     while outside - inside > max(1, inside // 50):
         found = outer_tube(loop, linear, attempt)
         middle = 0
