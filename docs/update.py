@@ -143,9 +143,14 @@ def between(begin: str, end: str, block: str, text: str) -> str:
 
 
 def demo_block(analysed: str) -> str:
-    """The part of README.md that shows what the demo prints, from what `analyse` printed; paths are the demo's."""
-    table = "\n".join(line.rstrip() for line in re.split(r"\nbag: ", analysed)[0].splitlines())
-    return f"```\n{table}\nbag:     bags/demo\npicture: bags/demo/overview.png\nreport:  bags/demo/report.html\n```\n"
+    """The part of README.md that shows what the demo prints first and last, from what `analyse` printed.
+
+    Paths are the demo's.
+    """
+    frame = "\n".join(line.rstrip() for line in re.split(r"^Link *$", analysed, flags=re.MULTILINE)[0].splitlines())
+    return (
+        f"```\n{frame}\n...\nbag:     bags/demo\npicture: bags/demo/overview.png\nreport:  bags/demo/report.html\n```\n"
+    )
 
 
 def readme_with(block: str) -> str:

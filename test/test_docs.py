@@ -71,6 +71,26 @@ def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> N
     assert block in (REPOSITORY / "README.md").read_text()
 
 
+def test_the_answer_in_metres_of_the_readme_is_true() -> None:
+    """22 updates within 0.25 m, by the closed form at the track's top speed; two of three laps, 19 of 20, by counting."""
+    import agv_ncs
+    from agv_analysis.simulation import simulate_batch
+
+    text = " ".join((REPOSITORY / "README.md").read_text().split())
+    said = re.search(r"within ([\d.]+) m as long as no outage is longer than (\d+) updates \((\d+) ms\)", text)
+    assert said is not None
+    width, n = float(said[1]), int(said[2])
+    scenario = agv_ncs.load_scenario("config/outages.yaml")
+    a, ts, top_speed = scenario.controller.kx * scenario.plant.ts, scenario.plant.ts, 1.5
+    farthest = [a * top_speed * ts * slots * (slots + 1) / 2 for slots in (n, n + 1)]
+    assert farthest[0] <= width < farthest[1]
+    assert int(said[3]) == round(1e3 * n * ts)
+    deviation = simulate_batch([scenario], range(1, 301))["deviation_max"][0]
+    assert "in about two of three laps of 100 s, and within 0.60 m it stays in 19 of 20" in text
+    assert (deviation > width).mean() == pytest.approx(2 / 3, abs=0.06)
+    assert (deviation <= 0.60).mean() == pytest.approx(19 / 20, abs=0.03)
+
+
 def test_the_page_of_the_report_has_every_key_of_the_json() -> None:
     import agv_ncs
 
