@@ -72,7 +72,7 @@ def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> N
 
 
 def test_the_answer_in_metres_of_the_readme_is_true() -> None:
-    """22 updates within 0.25 m, by the closed form at the track's top speed; two of three laps, 19 of 20, by counting."""
+    """22 updates within 0.25 m, by the closed form at the track's top speed; the shares of laps by counting."""
     import agv_ncs
     from agv_analysis.simulation import simulate_batch
 
