@@ -28,6 +28,8 @@ from agv_ros.substitution import Function, Replacements, calls_of, functions_in,
 HAS_NUMBA = importlib.util.find_spec("numba") is not None
 """Is numba installed? Without it, everything runs as plain Python."""
 
+_LOCATOR = "agv_analysis.compiled_cache.ContentLocator"
+
 _COMPILING = threading.Lock()
 """Held where numba's settings are changed for a moment."""
 
@@ -63,12 +65,16 @@ def _compile(function: Function, folder: Path | None, replacements: Replacements
     import numba
 
     copy = with_globals(function, _compiled_calls(function, replacements, {}))
-    usual = numba.config.CACHE_DIR
+    # Looked at by the decorator, not later. An older numba has no such locators, and compiles for each place anew.
+    wanted = {"CACHE_DIR": str(folder or ""), "CACHE_LOCATOR_CLASSES": _LOCATOR}
+    usual = {name: getattr(numba.config, name) for name in wanted if hasattr(numba.config, name)}
     try:
-        numba.config.CACHE_DIR = str(folder or "")  # looked at by the decorator, not later
+        for name in usual:
+            setattr(numba.config, name, wanted[name])
         dispatcher: Callable[..., Any] = numba.njit(nogil=True, cache=folder is not None)(copy)
     finally:
-        numba.config.CACHE_DIR = usual
+        for name, value in usual.items():
+            setattr(numba.config, name, value)
     return dispatcher
 
 

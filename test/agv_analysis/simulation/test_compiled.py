@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -95,7 +96,7 @@ print(compiled(outer.outer)(2.0))
 
 
 def test_a_change_in_any_file_or_constant_is_seen_in_spite_of_the_cache(tmp_path: Path) -> None:
-    pytest.importorskip("numba")
+    config = pytest.importorskip("numba").config
     folder, cache = tmp_path / "code", tmp_path / "cache"
     folder.mkdir()
     (folder / "outer.py").write_text(
@@ -108,6 +109,10 @@ def test_a_change_in_any_file_or_constant_is_seen_in_spite_of_the_cache(tmp_path
     kept = sorted(cache.rglob("*.nbc"))
     assert in_another_process(CALL, cache, str(folder)) == "30.0\n"
     assert sorted(cache.rglob("*.nbc")) == kept, "what was kept was not found again"
+    if hasattr(config, "CACHE_LOCATOR_CLASSES"):
+        shutil.copytree(folder, tmp_path / "copy")
+        assert in_another_process(CALL, cache, str(tmp_path / "copy")) == "30.0\n"
+        assert sorted(cache.rglob("*.nbc")) == kept, "the same code in another place was compiled again"
     (folder / "inner.py").write_text("def inner(x):\n    return x + 2.0\n")
     assert in_another_process(CALL, cache, str(folder)) == "40.0\n"
     (folder / "constants.py").write_text("FACTOR = 100.0\n")

@@ -224,9 +224,9 @@ def test_gilbert_elliott_with_p_plus_r_one_is_bernoulli() -> None:
 def test_gilbert_elliott_begins_good_and_reaches_its_balance() -> None:
     # P(bad at slot k) = p / (p + r) (1 - (1 - p - r)^k), over many seeds.
     c = ChannelParameters(model="gilbert_elliott", p=0.05, r=0.2)
-    lost = np.array([losses(c, seed, "uplink", 30) for seed in range(1000)])
+    lost = np.array([losses(c, seed, "uplink", 30) for seed in range(300)])
     expected = c.p / (c.p + c.r) * (1.0 - (1.0 - c.p - c.r) ** np.arange(30))
-    spread = np.sqrt(expected * (1.0 - expected) / 1000)
+    spread = np.sqrt(expected * (1.0 - expected) / 300)
     assert (abs(lost.mean(axis=0) - expected) <= 5.0 * spread).all()
 
 
