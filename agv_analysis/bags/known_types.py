@@ -9,6 +9,7 @@ more than one, the topic is not decoded: a number that may be wrong is worse tha
 from __future__ import annotations
 
 import functools
+import importlib.util
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +22,10 @@ from agv_analysis.bags.message_definitions import assemble, installed_definition
 from agv_analysis.bags.records import Schema
 from agv_analysis.bags.schema import parse_schema
 from agv_ros.errors import UserError
+
+_WITHOUT_ROSBAGS = (
+    "the bag does not hold the definition of its type; those of ROS 2 come with rosbags: `pip install rosbags`"
+)
 
 _ENDINGS = (".msg", ".idl", ".srv")
 _EVENT = "_Event"
@@ -76,9 +81,9 @@ class KnownTypes:
             known for known in self._candidates(schema.name, distro, type_hash) if _fits(schema.name, known, message)
         ]
         if not fitting:
-            if schema.encoding == "ros2msg":  # one without members, if its messages have no values either
+            if schema.encoding == "ros2msg" and _fits(schema.name, _Known("", "", ""), message):  # it has no members
                 return Definition(schema, "")
-            raise UndecodableError(NO_DEFINITION)
+            raise UndecodableError(NO_DEFINITION if importlib.util.find_spec("rosbags") else _WITHOUT_ROSBAGS)
         by_form = {_form(schema.name, known.text): known for known in reversed(fitting)}
         if len(by_form) > 1 and message is not None:
             sources = ", ".join(known.source for known in fitting)

@@ -283,7 +283,7 @@ def _report_holes(contents: Contents) -> None:
 def _by_metadata(path: Path) -> Contents:
     try:
         about = _read_metadata(path / METADATA)
-        listed = [_inside(path, str(name)) for name in about["relative_file_paths"]]
+        listed = list(dict.fromkeys(_inside(path, str(name)) for name in about["relative_file_paths"] or ()))
         topics = [
             (str(topic["topic_metadata"]["name"]), str(topic["topic_metadata"].get("type", "")), topic["message_count"])
             for topic in about["topics_with_message_count"] or ()
@@ -320,8 +320,10 @@ def _present(path: Path, listed: list[Path], findings: Findings) -> list[Path]:
         else:
             missing.append(file)
     others = [file for file in others if not any(_unpacked_name(file.name) == _unpacked_name(p.name) for p in present)]
-    renamed = others if missing else []
-    if renamed:
+    renamed = others if missing or not listed else []
+    if not listed:
+        findings.add(f"{METADATA} that names no files, all files read in the order of their numbers")
+    elif renamed:
         names, found = ", ".join(file.name for file in missing), ", ".join(file.name for file in renamed)
         findings.add(f"{names} named by {METADATA} but missing, {found} read in place of it")
     for file in missing[len(renamed) :]:

@@ -212,6 +212,10 @@ BAGS |= {
     "renamed split": lambda folder: renamed(split(folder / "x", [0, 1], False, True), "x_1.db3", "y_1.db3"),
     "no storage identifier": lambda folder: humble_directory(folder / "bag", storage_identifier=""),
     "wrong storage identifier": lambda folder: humble_directory(folder / "bag", storage_identifier="mcap"),
+    "no files in metadata.yaml": lambda folder: humble_directory(folder / "bag", relative_file_paths=[]),
+    "a file twice in metadata.yaml": lambda folder: humble_directory(
+        folder / "bag", relative_file_paths=["bag_0.db3", "bag/bag_0.db3"]
+    ),
     "compressed by hand": lambda folder: renamed(
         split(folder / "x", [0, 1], True, True), "x_1.db3.zstd", "x_1.db3.zst"
     ),

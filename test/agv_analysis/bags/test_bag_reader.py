@@ -254,6 +254,19 @@ def test_rosbag2_directories_by_rosbags(tmp_path: Path, storage: StoragePlugin, 
     assert_whole(tmp_path / "bag", same_publish_time=True)
 
 
+@pytest.mark.parametrize("kind", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_compressed_directories_without_metadata(tmp_path: Path, kind: StoragePlugin, mode: CompressionMode) -> None:
+    writer = Rosbag2Writer(tmp_path / "bag", version=9, storage_plugin=kind)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        _fill(writer)
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    assert_whole(tmp_path / "bag", same_publish_time=True)
+    (file,) = (tmp_path / "bag").iterdir()
+    assert_whole(file, same_publish_time=True)
+
+
 def test_a_bare_sqlite3_file(tmp_path: Path) -> None:
     with Rosbag2Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
         _fill(writer)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -97,6 +99,32 @@ def test_a_type_without_members_needs_no_definition(tmp_path: Path) -> None:
         bag = read_bag(write(tmp_path / "a.mcap", kind, [b"\0\1\0\0\0"] * 2))
         assert len(bag["/t"]) == 2
         assert bag.problems == ()
+
+
+WITHOUT_ROSBAGS = """
+import sys
+sys.modules["rosbags"] = None
+from agv_analysis.bags import BagError, read_bag
+bag = read_bag(sys.argv[1])
+print(len(bag.payloads("/reading")))
+try:
+    bag["/reading"]
+except BagError as error:
+    print(error)
+"""
+
+
+def test_without_rosbags_sqlite3_is_read_and_its_types_are_asked_for(
+    tmp_path: Path, make_database: Callable[..., Path]
+) -> None:
+    path = make_database(tmp_path / "a.db3")
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_ROSBAGS, str(path)], capture_output=True, text=True, check=True,
+        cwd=Path(__file__).parents[3],
+    )  # fmt: skip
+    count, error = done.stdout.splitlines()
+    assert count == "7"
+    assert "those of ROS 2 come with rosbags: `pip install rosbags`" in error
 
 
 # -- a folder of definitions ------------------------------------------------------------------------------------------
