@@ -106,23 +106,30 @@ class SqliteFile:
     def _columns(self, table: str) -> list[str]:
         return [str(row[1]) for row in self._database.execute(f"PRAGMA table_info({table})")]
 
+    def _select(self, table: str, columns: list[str]) -> Iterator[tuple[Any, ...]]:
+        """Some columns of a table, empty where it has no such column; no rows if there is no such table."""
+        there = self._columns(table)
+        if there:
+            names = ", ".join(column if column in there else "''" for column in columns)
+            yield from self._database.execute(f"SELECT {names} FROM {table} ORDER BY rowid")
+
     def _describe(self) -> None:
-        columns = self._columns("topics")
-        if not columns or not self._columns("messages"):
+        if not self._columns("topics") or not self._columns("messages"):
             raise BagError(f"{self.path}: a database, but no bag: it lacks rosbag2's tables `topics` and `messages`")
-        if self._columns("schema"):
-            self.distro = str((self._database.execute("SELECT ros_distro FROM schema").fetchone() or [""])[0])
-        definitions: dict[str, tuple[str, Any]] = {}
-        if self._columns("message_definitions"):
-            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions ORDER BY id DESC"
-            definitions = {str(kind): (str(encoding), text) for kind, encoding, text in self._database.execute(query)}
-        wanted = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
-        query = ", ".join(column if column in columns else "''" for column in wanted)
-        for number, name, kind, form, qos, type_hash in self._database.execute(f"SELECT {query} FROM topics"):
-            encoding, text = definitions.get(str(kind), ("ros2msg", ""))
-            self.schemas[int(number)] = Schema(int(number), str(kind), encoding, str(text).encode())
-            about = {QOS: str(qos), TYPE_HASH: str(type_hash)}
-            self.channels[int(number)] = Channel(int(number), int(number), str(name), str(form), about)
+        self.distro = _text(next(self._select("schema", ["ros_distro"]), ("",))[0])
+        kinds = self._select("message_definitions", ["topic_type", "encoding", "encoded_message_definition"])
+        definitions: dict[str, tuple[str, str]] = {}
+        for kind, encoding, text in kinds:
+            definitions.setdefault(_text(kind), (_text(encoding), _text(text)))
+        wanted = ["id", "name", "type", "serialization_format", QOS, "type_description_hash"]
+        for number, name, kind, form, qos, type_hash in self._select("topics", wanted):
+            if not isinstance(number, int):
+                self.findings.add("row that describes no topic, left out", is_loss=True)
+                continue
+            encoding, text = definitions.get(_text(kind), ("ros2msg", ""))
+            self.schemas[number] = Schema(number, _text(kind), encoding, text.encode())
+            about = {QOS: _text(qos), TYPE_HASH: _text(type_hash)}
+            self.channels[number] = Channel(number, number, _text(name), _text(form), about)
         query = "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
         self._expected: dict[int, int] = {}
         self._is_sound = self._check()
@@ -223,6 +230,13 @@ class SqliteFile:
         for number in dict.fromkeys(topics):
             mine = owner == number
             yield self.channels.get(number) or undescribed(number), Batch(buffer, starts[mine], sizes[mine])
+
+
+def _text(value: object) -> str:
+    """A text as it should be; what else a cell may hold is made one."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return "" if value is None else str(value)
 
 
 class _Numbers:

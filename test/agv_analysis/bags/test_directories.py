@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -96,8 +98,6 @@ def test_the_true_reason_why_a_database_is_not_decoded(tmp_path: Path, make_data
 
 
 def test_rows_of_a_topic_that_is_not_described_are_counted(tmp_path: Path, make_database: Callable[..., Path]) -> None:
-    import sqlite3
-
     path = make_database(tmp_path / "a.db3")
     database = sqlite3.connect(path)
     database.execute("DELETE FROM topics WHERE name = '/point'")
@@ -124,8 +124,27 @@ def test_a_damaged_database_is_read_behind_the_damage(tmp_path: Path, make_datab
 
 
 def test_a_database_that_is_no_bag_is_refused(tmp_path: Path) -> None:
-    import sqlite3
-
     sqlite3.connect(tmp_path / "a.db3").execute("CREATE TABLE t(x)").connection.close()
     with pytest.raises(BagError, match="a database, but no bag: it lacks rosbag2's tables `topics` and `messages`"):
         read_bag(tmp_path / "a.db3")
+
+
+def test_what_a_database_lacks_or_holds_in_another_form_does_not_refuse_it(
+    tmp_path: Path, make_database: Callable[..., Path]
+) -> None:
+    path = make_database(tmp_path / "a.db3")
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript(
+            "ALTER TABLE schema DROP COLUMN ros_distro;"
+            "CREATE TABLE message_definitions(id INTEGER, topic_type BLOB, encoding TEXT, encoded_message_definition);"
+        )
+        text = b"float64[3] values\nstring unit"
+        database.execute("INSERT INTO message_definitions VALUES (1, ?, 'ros2msg', ?)", (b"my_msgs/msg/Reading", text))
+        database.execute("CREATE TABLE loose AS SELECT * FROM topics")
+        database.executescript("DROP TABLE topics; ALTER TABLE loose RENAME TO topics;")
+        database.execute("INSERT INTO topics VALUES ('no number', NULL, NULL, NULL, NULL)")
+        database.commit()
+    bag = read_bag(path)
+    assert bag["/reading"]["values"][:, 0].tolist() == [float(i) for i in range(7)]
+    assert len(bag["/point"]) == 7
+    assert "row that describes no topic, left out: 1" in bag.problems
