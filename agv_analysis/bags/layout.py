@@ -172,10 +172,12 @@ class _Trace:
     def _strings(self, path: str, count: int | None, index: Index) -> None:
         for place in [index] if count is None else ((*index, i) for i in range(count)):
             length = self._word(path)
-            if length == 0:  # without its final zero: the zeros of the length word are as good
-                self._add(path, "S1", None, place, BODY + self.position - 4)
+            word = BODY + self.position - 4
+            begin = self._take(path, 1, length)
+            if length <= 1:  # of its final zero, if it has one: the length word has zeros that are known to be
+                self._add(path, "S1", None, place, word + (self.order == "<"))
             else:
-                self._add(path, f"S{max(1, length - 1)}", None, place, self._take(path, 1, length))
+                self._add(path, f"S{length - 1}", None, place, begin)
 
     def _structs(self, kind: Struct, prefix: str, count: int, index: Index) -> None:
         if count > self._end - self.position:

@@ -189,8 +189,13 @@ def test_a_column_of_strings_is_as_wide_as_the_longest() -> None:
 
 def test_a_string_without_its_final_zero_is_empty_or_cut_by_one() -> None:
     table = table_of("std_msgs/msg/String")
-    table.append(batch_of([b"\0\1\0\0" + b"\0\0\0\0", b"\0\1\0\0" + b"\1\0\0\0" + b"\0"]))
-    assert table.rows["data"].tolist() == [b"", b""]
+    little, big = b"\0\1\0\0", b"\0\0\0\0"
+    contents = [
+        little + b"\0\0\0\0", little + b"\1\0\0\0\0", little + b"\1\0\0\0m", big + b"\0\0\0\1m",
+        little + b"\3\0\0\0map", big + b"\0\0\0\3map",
+    ]  # fmt: skip
+    table.append(batch_of(contents))
+    assert table.rows["data"].tolist() == [b"", b"", b"", b"", b"ma", b"ma"]
 
 
 def test_messages_of_another_type_are_counted_and_left_out() -> None:
