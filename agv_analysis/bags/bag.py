@@ -166,7 +166,7 @@ class _Reading:
         self._wanted = None if topics is None else frozenset(topics)
         self._findings = Findings()
         self._known: dict[str, tuple[Channel, Schema | None]] = {}
-        self._borrowed: dict[str, str] = {}
+        self._borrowed: dict[str, Definition] = {}
         self._first: dict[str, Schema] = {}
         self._forms: dict[tuple[str, str, bytes], Struct] = {}
         self._tables: dict[str, Table | JsonTable] = {}
@@ -257,7 +257,7 @@ class _Reading:
         distro = storage.distro or self._contents.distro
         found = self._types.define(schema, distro, channel.metadata.get(TYPE_HASH, ""), message)
         if found.source:
-            self._borrowed[channel.topic] = found.source
+            self._borrowed[channel.topic] = found
         return found
 
     def _form(self, schema: Schema) -> Struct:
@@ -291,9 +291,9 @@ class _Reading:
         with ThreadPoolExecutor(_THREADS, "bag") as pool:
             for found in pool.map(check_times, unclear, map(arrays.__getitem__, unclear)):
                 self._findings.merge(found)
-        for topic, source in sorted(self._borrowed.items()):
+        for topic, definition in sorted(self._borrowed.items()):
             if topic in arrays:
-                self._findings.add(f"{topic}: topic whose definition is not in the bag, that of {source} used")
+                self._findings.add(f"{topic}: {definition.note} used")
         for topic, reason in sorted(self._refusals.items()):
             self._findings.add(f"{topic}: topic that {reason}")
         topics = {name: self._topic(name) for name in sorted(self._known)}
@@ -308,7 +308,9 @@ class _Reading:
         channel, schema = self._known[name]
         kind, text = (schema.name, schema.text) if schema else ("", "")
         has_own = schema is not None and not is_undefined(schema)
-        source = self._borrowed.get(name, "the bag" if has_own or name in self._tables else "")
+        source = "the bag" if has_own or name in self._tables else ""
+        if name in self._borrowed:
+            source = self._borrowed[name].source
         return Topic(
             name, kind, self._counts[name], text, channel.metadata.get(QOS, ""), channel.encoding, source,
         )  # fmt: skip

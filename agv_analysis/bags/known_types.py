@@ -20,12 +20,11 @@ from agv_analysis.bags.layout import trace
 from agv_analysis.bags.message_batch import NO_DEFINITION
 from agv_analysis.bags.message_definitions import assemble, installed_definition
 from agv_analysis.bags.records import Schema
-from agv_analysis.bags.schema import parse_schema
+from agv_analysis.bags.schema import MissingTypeError, definitions_by_name, parse_schema, short_name
 from agv_ros.errors import UserError
 
-_WITHOUT_ROSBAGS = (
-    "the bag does not hold the definition of its type; those of ROS 2 come with rosbags: `pip install rosbags`"
-)
+_UNDEFINED = "the bag does not hold the definition of its type"
+_WITHOUT_ROSBAGS = f"{_UNDEFINED}; those of ROS 2 come with rosbags: `pip install rosbags`"
 
 _ENDINGS = (".msg", ".idl", ".srv")
 _EVENT = "_Event"
@@ -37,6 +36,12 @@ class Definition(NamedTuple):
     schema: Schema
     source: str
     """As in "ROS 2 humble"; empty if the bag holds it."""
+    gap: str = "is not in the bag, that of"
+
+    @property
+    def note(self) -> str:
+        """What is said of a definition that the bag does not hold."""
+        return f"topic whose definition {self.gap} {self.source}"
 
 
 class _Known(NamedTuple):
@@ -72,14 +77,17 @@ class KnownTypes:
     def define(self, schema: Schema, distro: str, type_hash: str, message: bytes | None) -> Definition:
         """The definition of a type: the bag's own `schema`, or, if that is empty, one from elsewhere.
 
-        `distro`, `type_hash`: what the bag says, or empty; `message`: one of the type, behind its lead.
+        Types that the bag's own uses without describing them are taken from elsewhere, too. `distro`, `type_hash`: what
+        the bag says, or empty; `message`: one of the type, behind its lead.
         Raises UndecodableError if no definition is known, or more than one and nothing says which.
         """
         if not is_undefined(schema):
-            return Definition(schema, "")
-        fitting = [
-            known for known in self._candidates(schema.name, distro, type_hash) if _fits(schema.name, known, message)
-        ]
+            return self._completed(schema, distro)
+        candidates = self._candidates(schema.name, distro, type_hash)
+        fitting = [known for known in candidates if _fits(schema.name, known, message)]
+        if candidates and not fitting:
+            sources = ", ".join(known.source for known in candidates)
+            raise UndecodableError(f"{_UNDEFINED}, and that of {sources} does not describe its messages")
         if not fitting:
             if schema.encoding == "ros2msg" and _fits(schema.name, _Known("", "", ""), message):  # it has no members
                 return Definition(schema, "")
@@ -87,7 +95,7 @@ class KnownTypes:
         by_form = {_form(schema.name, known.text): known for known in reversed(fitting)}
         if len(by_form) > 1 and message is not None:
             sources = ", ".join(known.source for known in fitting)
-            raise UndecodableError(f"{NO_DEFINITION}, and there are several that fit it ({sources})")
+            raise UndecodableError(f"{_UNDEFINED}, and there are several that describe its messages ({sources})")
         chosen = next(iter(by_form.values()))
         is_empty = _form(schema.name, chosen.text).is_empty
         found = schema.defined_by("ros2msg", chosen.text.encode())
@@ -108,13 +116,31 @@ class KnownTypes:
         if self._read(kind) is None and self._read(_service(kind)) is None:
             return None
 
-        def find(name: str) -> str | None:
-            text = self._read(name)
-            if text is None and (others := _of_distributions(name, distro)):
-                text = others[0].text.split("\n====")[0]
-            return _installed(name) if text is None else text
+        return _assembled(kind, lambda name: self._alone(name, distro))
 
-        return _assembled(kind, find)
+    def _alone(self, kind: str, distro: str) -> str | None:
+        """Definition of one type without those of the types in it; None if there is none, or several."""
+        text = self._read(kind)
+        if text is None:
+            found = _of_distributions(kind, distro)
+            if len({_form(kind, known.text) for known in found}) > 1:
+                return None
+            text = found[0].text.split("\n====")[0] if found else _installed(kind)
+        return text
+
+    def _completed(self, schema: Schema, distro: str) -> Definition:
+        """A definition with those of the types in it, if the bag does not hold these, but they are known elsewhere."""
+        try:
+            texts = definitions_by_name(schema.name, schema.encoding, schema.text)
+            parse_schema(schema.name, schema.encoding, schema.text)
+        except MissingTypeError:
+            text = _assembled(schema.name, lambda name: texts.get(short_name(name)) or self._alone(name, distro))
+            if text is not None:
+                source = "ROS 2" if self._folder is None else str(self._folder)
+                return Definition(schema.defined_by("ros2msg", text.encode()), source, "lacks types, those of")
+        except UndecodableError:
+            pass  # whoever parses it says why
+        return Definition(schema, "")
 
     def _read(self, kind: str) -> str | None:
         """Text of one definition of the folder in the message language, without those of the types in it."""

@@ -81,7 +81,7 @@ class _Checked:
         self._layouts: Layouts | None = None
         self.schema = schema
         """With a definition from elsewhere if the bag has none and that describes the first message."""
-        self._source = ""
+        self._definition: Definition | None = None
         self._reason = ""
         """Why messages cannot be held against the definition, if so."""
         self._count = 0
@@ -90,7 +90,8 @@ class _Checked:
                 raise UndecodableError(f"they are encoded as {channel.encoding!r}")
             if schema is None:
                 raise UndecodableError(NO_DEFINITION)
-            self.schema, self._source = define(schema)
+            self._definition = define(schema)
+            self.schema = self._definition.schema
             self._layouts = Layouts(parse_schema(self.schema.name, self.schema.encoding, self.schema.text))
         except UndecodableError as error:
             self._reason = str(error)
@@ -106,8 +107,8 @@ class _Checked:
 
     def report(self, topic: str, findings: Findings) -> None:
         """Say which messages were copied although nothing describes them."""
-        if self._source:
-            findings.add(f"{topic}: topic whose definition is not in the bag, that of {self._source} written")
+        if self._definition is not None and self._definition.source:
+            findings.add(f"{topic}: {self._definition.note} written")
         if self._reason and self._count:
             findings.add(f"{topic}: message copied as it is, unchecked ({self._reason})", self._count)
         elif self._layouts is not None and self._layouts.misfits:

@@ -41,6 +41,10 @@ _FIELD = re.compile(
 )
 
 
+class MissingTypeError(UndecodableError):
+    """A definition that uses a type without describing it."""
+
+
 @dataclass(frozen=True)
 class Member:
     """One member of a message on the wire."""
@@ -159,7 +163,7 @@ def resolve_type(texts: dict[str, str], kind: str, parent: str) -> str:
     for candidate in candidates:
         if candidate in texts:
             return candidate
-    raise UndecodableError(f"its definition uses the type {kind!r} without describing it")
+    raise MissingTypeError(f"its definition uses the type {kind!r} without describing it")
 
 
 def parse_line(line: str) -> Member | None:

@@ -150,6 +150,7 @@ def outages(
     from agv_analysis.commands.link import show_measurement
     from agv_analysis.link.formats.bag_topic import measure_topic
 
+    topic = f"/{topic.strip('/')}"  # as the topics of a bag are named
     with _bar(bag, "reading") as progress:
         content = read_bag(bag, [topic], progress, definitions)
     if topic not in content.topics:

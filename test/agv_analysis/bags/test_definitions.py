@@ -127,6 +127,21 @@ def test_without_rosbags_sqlite3_is_read_and_its_types_are_asked_for(
     assert "those of ROS 2 come with rosbags: `pip install rosbags`" in error
 
 
+def test_a_definition_without_those_of_the_types_in_it_is_completed(tmp_path: Path) -> None:
+    """As writers leave it that put a .msg file into a bag and no more."""
+    text = JAZZY.generate_msgdef(RANGE, ros_version=2)[0].split("\n====")[0]
+    path = write(tmp_path / "a.mcap", RANGE, ranges(JAZZY), ("ros2msg", text.encode()))
+    bag = read_bag(path)
+    assert bag["/t"]["range"].tolist() == [0.0, 1.0, 2.0]
+    assert bag["/t"]["header.frame_id"].tolist() == [b"sonar"] * 3
+    assert "/t: topic whose definition lacks types, those of ROS 2 used: 1" in bag.problems
+    unknown = write(tmp_path / "b.mcap", WHEEL, wheels(), ("ros2msg", WHEEL_MSG.encode()))
+    with pytest.raises(BagError, match=r"its definition uses the type .* without describing it"):
+        read_bag(unknown)["/t"]
+    (tmp_path / "Side.msg").write_text(SIDE_MSG)
+    assert_wheels(read_bag(unknown, definitions=tmp_path))
+
+
 # -- a folder of definitions ------------------------------------------------------------------------------------------
 
 WHEEL_MSG = "std_msgs/Header header\nSide side\ngeometry_msgs/Point[] contacts\nfloat32[2] force\n"

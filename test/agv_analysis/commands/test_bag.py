@@ -192,7 +192,7 @@ def test_outages_of_a_topic_are_those_that_were_left_out(tmp_path: Path, form: s
                 writer.add_message(channel, ns + int(late[k]), body, ns)
         writer.finish()  # type: ignore[no-untyped-call]
     out = tmp_path / "out.json"
-    result = agv_ncs("bag", "outages", tmp_path / "a.mcap", "--topic", "/scan", "--json", out)
+    result = agv_ncs("bag", "outages", tmp_path / "a.mcap", "--topic", "scan", "--json", out)
     assert result.exit_code == 0
     uplink = json.loads(out.read_text())["uplink"]
     begins = sum(k - 1 not in lost for k in lost)
