@@ -1,8 +1,10 @@
 """One MCAP file -> its messages, batch by batch, and everything that is wrong with it.
 
 Theory of operation. The file is read once, from its first record to its last; no index is needed for that, nor is one
-believed. Each record must have the lengths inside it add up to its own. Where one does not, the chunk that it may be
-is tried first (`rescue_chunk`), then the next record is searched for, and what lies between is reported. What a CRC
+believed. The lengths inside each record must add up to its own, or to less if another record follows: what is behind
+its last field is then what a newer version of MCAP has added, as are records of unknown kinds. Where they do not, the
+chunk that it may be is tried first (`rescue_chunk`), then the next record is searched for, and what lies between is
+reported. What a CRC
 covers is used only if it matches; what none covers is used and reported as not checked. Message indexes are hints for
 finding the messages of a chunk fast (`chunk.find`). Definitions of topics are taken from the place that a CRC covers,
 where there is one: the summary at the end of the file repeats those of the chunks.
@@ -14,11 +16,9 @@ Python's lock.
 from __future__ import annotations
 
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,18 +32,17 @@ from agv_analysis.bags.chunk import (
     cut_chunk,
     is_as_declared,
     is_wrong_length,
-    largest_size,
     messages_at,
     open_chunk,
     rescue_chunk,
     run_of_messages,
-    sort_out,
     walk,
 )
 from agv_analysis.bags.definitions import Definitions
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.layout import LEAD
 from agv_analysis.bags.message_batch import Batch, Bytes
+from agv_analysis.bags.open_ahead import Cut, Item, Opened, Packed, Run, open_ahead
 from agv_analysis.bags.records import (
     ATTACHMENT,
     CHANNEL,
@@ -65,9 +64,7 @@ from agv_analysis.bags.records import (
     STATISTICS,
     Attachment,
     Channel,
-    Chunk,
     Footer,
-    Index,
     Schema,
     Statistics,
     has_shape,
@@ -85,14 +82,6 @@ from agv_analysis.bags.storage import IsWanted, is_large, undescribed
 _DISTRO = re.compile(r"^ros_distro:\s*['\"]?(\w+)", re.MULTILINE)
 
 _WINDOW = 2**20
-_TOGETHER = 2**20
-"""Bytes of chunks, when inflated, that go to the other thread at a time."""
-
-_MOST_TOGETHER = 1000
-"""Chunks that do so at most, however small they are."""
-
-_AHEAD = 3 * _TOGETHER
-"""Bytes that may be inflated ahead, unless a single chunk has more; a processor's cache holds them until their turn."""
 
 EXTENDED = "record with bytes after the last field that is known here, these ignored"
 
@@ -101,50 +90,6 @@ _LONGEST_FOOTER = 2**12
 
 _MAX_DAMAGES = 10_000
 """Damaged places of a file that are skipped, at most."""
-
-
-class _Run(NamedTuple):
-    """Messages outside of any chunk that follow each other."""
-
-    position: int
-    content: bytes
-    starts: list[int]
-
-
-class _Packed(NamedTuple):
-    """A chunk."""
-
-    position: int
-    chunk: Chunk
-    indexes: list[Index]
-    """Of its messages."""
-
-
-class _Opened(NamedTuple):
-    """A chunk, inflated."""
-
-    content: bytes
-    found: Content
-    is_indexed: bool
-    """Do its message indexes name exactly its messages?"""
-
-
-class _Cut(NamedTuple):
-    """What is left of a chunk within which the file ends."""
-
-    position: int
-    content: bytes
-
-
-_Item = _Run | _Packed | _Cut
-
-
-class _Some(NamedTuple):
-    """What goes to the other thread at a time."""
-
-    items: list[_Item]
-    size: int
-    """Bytes, when inflated."""
 
 
 def _has_shape(record: Record, opcode: int) -> bool:
@@ -215,17 +160,17 @@ class McapFile:
 
     def batches(self, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         """The messages of all channels that are wanted, in file order, in batches of one channel. To be called once."""
-        for item, opened in _ahead(self._items(), is_large=is_large(self.size)):
+        for item, opened in open_ahead(self._items(), is_large=is_large(self.size)):
             self.position = item.position
-            if isinstance(item, _Run):
+            if isinstance(item, Run):
                 if not self._is_proven:
                     self.findings.add_unchecked("messages outside of chunks", len(item.starts))
                 buffer = np.frombuffer(item.content, np.uint8)
                 messages = messages_at(buffer, np.array(item.starts, np.int64))
                 yield from self._split(buffer, by_channel(buffer, messages), is_wanted)
-            elif isinstance(item, _Cut):
+            elif isinstance(item, Cut):
                 yield from self._content(item.position, item.content, walk(item.content, is_cut=True), False, is_wanted)
-            elif isinstance(opened, _Opened):
+            elif isinstance(opened, Opened):
                 yield from self._unpack(item, opened, is_wanted)
             elif opened is not None:
                 number = sum(len(index.places) for index in item.indexes)
@@ -335,9 +280,9 @@ class McapFile:
 
     # -- records -----------------------------------------------------------------------------------------------------
 
-    def _items(self) -> Iterator[_Item]:
+    def _items(self) -> Iterator[Item]:
         """What holds messages, chunks together with their message indexes; all else is taken note of on the way."""
-        packed: _Packed | None = None
+        packed: Packed | None = None
         for item in self._records():
             if isinstance(item, Record) and item.opcode == MESSAGE_INDEX and packed is not None:
                 self._take(item, packed)
@@ -345,7 +290,7 @@ class McapFile:
             if packed is not None:
                 yield packed
                 packed = None
-            if isinstance(item, _Packed):
+            if isinstance(item, Packed):
                 packed = item
             elif isinstance(item, Record):
                 self._take(item, None)
@@ -354,7 +299,7 @@ class McapFile:
         if packed is not None:
             yield packed
 
-    def _take(self, record: Record, packed: _Packed | None) -> None:
+    def _take(self, record: Record, packed: Packed | None) -> None:
         """Take note of a record outside of chunks that holds no messages."""
         try:
             if record.opcode == MESSAGE_INDEX and packed is not None:
@@ -388,11 +333,11 @@ class McapFile:
             except DamagedError as error:
                 self.findings.add(f"damaged definition of a topic, not used ({error})")
 
-    def _records(self) -> Iterator[Record | _Item]:
+    def _records(self) -> Iterator[Record | Item]:
         """Everything sound in the file, in order; what is not is passed over and reported."""
         position = len(MAGIC)
         while not self._source.is_end(position):
-            item: Record | _Item | None
+            item: Record | Item | None
             try:
                 item, position = self._next(position)
             except DamagedError as error:
@@ -404,7 +349,7 @@ class McapFile:
             if item is not None:
                 yield item
 
-    def _next(self, position: int) -> tuple[Record | _Run | _Packed | None, int]:
+    def _next(self, position: int) -> tuple[Record | Run | Packed | None, int]:
         """What is at `position`, and where it ends. Raises DamagedError."""
         record = self._source.record(position)
         if record.extra:
@@ -425,12 +370,12 @@ class McapFile:
         self.findings.add(_unknown(record.opcode), at=position)
         return None, record.end
 
-    def _disguised(self, record: Record) -> _Packed | None:
+    def _disguised(self, record: Record) -> Packed | None:
         """The chunk that a record is whose opcode says otherwise; None if it has not the shape of one."""
         if not _has_shape(record, CHUNK):
             return None
         self.findings.add("chunk under another opcode", at=record.position)
-        return _Packed(record.position, parse_chunk(record.content), [])
+        return Packed(record.position, parse_chunk(record.content), [])
 
     def _doubt(self, record: Record) -> None:
         """Raise DamagedError if bytes after a record's last field look like a wrong opcode or a wrong inner length."""
@@ -439,30 +384,30 @@ class McapFile:
         if record.opcode == CHUNK:
             open_chunk(parse_chunk(record.content))
 
-    def _packed(self, record: Record) -> tuple[_Packed, int]:
+    def _packed(self, record: Record) -> tuple[Packed, int]:
         """A chunk with the sound message indexes that follow it, and where they end."""
-        packed, position = _Packed(record.position, parse_chunk(record.content), []), record.end
+        packed, position = Packed(record.position, parse_chunk(record.content), []), record.end
         while (found := self._source.index(position)) is not None:
             index, position = found
             packed.indexes.append(index)
         return packed, position
 
-    def _run(self, first: Record) -> tuple[_Run, int]:
+    def _run(self, first: Record) -> tuple[Run, int]:
         """Messages outside of chunks, as many as follow each other within a window, and where the next record is."""
         position = first.position
         content = self._source.read(position, max(_WINDOW, first.end - position))
         starts, length = run_of_messages(content, 0)
         end = position + length
         if self._source.is_record(end, depth=0) or self._source.is_followed(end):
-            return _Run(position, content, starts), end
+            return Run(position, content, starts), end
         after = self._source.next_record(position + starts[-1])
         if after is not None and is_wrong_length(position + starts[-1], end, after):
             at = position + starts.pop()
             self.findings.add("message of a wrong length, left out", at=at, messages=1, is_loss=True)
-            return _Run(position, content, starts), after
-        return _Run(position, content, starts), end
+            return Run(position, content, starts), after
+        return Run(position, content, starts), end
 
-    def _pass_over(self, position: int, why: str) -> tuple[_Packed | _Cut | None, int]:
+    def _pass_over(self, position: int, why: str) -> tuple[Packed | Cut | None, int]:
         """What can be recovered at a damaged place, and where the next record is."""
         begin = position + RECORD.size
         left = self._source.size - begin
@@ -476,11 +421,11 @@ class McapFile:
             rescued = rescue_chunk(length, left, read)
             if rescued is not None:
                 self.findings.add("chunk whose lengths contradict each other, read all the same", at=position)
-                return _Packed(position, rescued[0], []), begin + rescued[1]
+                return Packed(position, rescued[0], []), begin + rescued[1]
             content = cut_chunk(length, left, read)
             if content is not None:
                 self.findings.add("chunk within which the file ends", at=position, is_loss=True)
-                return _Cut(position, content), self._source.size
+                return Cut(position, content), self._source.size
         after = self._source.next_record(position)
         if after is None:
             what = "rest of the file, searched no further" if self._source.has_given_up else "end without a record"
@@ -491,7 +436,7 @@ class McapFile:
 
     # -- chunks ------------------------------------------------------------------------------------------------------
 
-    def _unpack(self, packed: _Packed, opened: _Opened, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
+    def _unpack(self, packed: Packed, opened: Opened, is_wanted: IsWanted) -> Iterator[tuple[Channel, Batch]]:
         chunk, position = packed.chunk, packed.position
         content, found, is_indexed = opened
         if not chunk.crc:
@@ -526,44 +471,3 @@ class McapFile:
             self.counts[number] += len(mine.starts)
             if is_wanted(channel):
                 yield channel, Batch(buffer, mine.starts + lead, mine.lengths - (MESSAGE_HEAD - LEAD))
-
-
-def _open(item: _Item, is_large: bool) -> _Opened | DamagedError | None:
-    """A chunk inflated and checked, its messages found, or what is wrong with it; None for anything else."""
-    if not isinstance(item, _Packed):
-        return None
-    try:
-        content = open_chunk(item.chunk)
-    except DamagedError as error:
-        return error
-    return _Opened(content, *sort_out(content, item.indexes, is_large))
-
-
-def _open_all(items: list[_Item], is_large: bool) -> list[_Opened | DamagedError | None]:
-    return [_open(item, is_large) for item in items]
-
-
-def _ahead(items: Iterator[_Item], is_large: bool) -> Iterator[tuple[_Item, _Opened | DamagedError | None]]:
-    """The same items, a few chunks ahead being opened on another thread."""
-    waiting: deque[tuple[_Some, Future[list[_Opened | DamagedError | None]]]] = deque()
-    with ThreadPoolExecutor(1, "bag") as pool:
-        for some in _together(items):
-            waiting.append((some, pool.submit(_open_all, some.items, is_large)))
-            while len(waiting) > 1 and sum(ahead.size for ahead, _ in waiting) > _AHEAD:
-                ready, opened = waiting.popleft()
-                yield from zip(ready.items, opened.result(), strict=True)
-        for ready, opened in waiting:
-            yield from zip(ready.items, opened.result(), strict=True)
-
-
-def _together(items: Iterator[_Item]) -> Iterator[_Some]:
-    """The items, several at a time unless they are large: to wake a thread takes as long as a small chunk does."""
-    some, size = [], 0
-    for item in items:
-        some.append(item)
-        size += largest_size(item.chunk) if isinstance(item, _Packed) else len(item.content)
-        if size >= _TOGETHER or len(some) == _MOST_TOGETHER:
-            yield _Some(some, size)
-            some, size = [], 0
-    if some:
-        yield _Some(some, size)

@@ -150,12 +150,13 @@ def outages(
     from agv_analysis.commands.link import show_measurement
     from agv_analysis.link.formats.bag_topic import measure_topic
 
-    topic = f"/{topic.strip('/')}"  # as the topics of a bag are named
+    names = (topic, f"/{topic.strip('/')}")
     with _bar(bag, "reading") as progress:
-        content = read_bag(bag, [topic], progress, definitions)
-    if topic not in content.topics:
+        content = read_bag(bag, names, progress, definitions)
+    name = next((name for name in names if name in content.topics), None)
+    if name is None:
         raise BagError(f"{bag}: no topic {topic}; it has {', '.join(content.topics) or 'none'}")
-    measured = measure_topic(content, topic, period)
+    measured = measure_topic(content, name, period)
     found = show_measurement(Console(highlight=False), measured, None, "half", trace, picture)
     if json_file is not None:
         write_json(json_file, found)
