@@ -34,7 +34,7 @@ _LONG = 2**25
 @click.option("--topic", default="", help="Which topic of a bag.")
 @click.option("--received", type=click.Path(path_type=Path), help="The capture at the other end, beside FILE.")
 @click.option(
-    "--rtt", type=click.Choice(["half", "up", "down"]), default="half", show_default=True,
+    "--rtt", type=click.Choice(["up", "half", "down"]), default="up", show_default=True,
     help="Where only round trips are known: on which way packets and time were lost.",
 )  # fmt: skip
 @click.option("--trace", type=click.Path(path_type=Path), help="Write a file for the channel trace, with times.")

@@ -12,10 +12,12 @@ from agv_analysis.run import Floats
 from agv_ros.errors import UserError
 
 UP, DOWN, HALF = "up", "down", "half"
-ROUND_TRIPS = (HALF, UP, DOWN)
+ROUND_TRIPS = (UP, HALF, DOWN)
 """On which way a round trip lost its packet and its time, where that is all that is known.
 
-half: each way takes half the time, and the packet was lost on the way up; up, down: all of it on this way."""
+up, down: all of it on this way; half: each way takes half the time, and the packet was lost on the way up. To the age
+of the pose behind the command that acts only the sum matters, and criteria know late poses; so `up` is what is usual.
+"""
 
 
 class LinkOfLoop(NamedTuple):
@@ -33,7 +35,7 @@ class LinkOfLoop(NamedTuple):
     """What was assumed."""
 
 
-def link_of_loop(measured: Measurement, rtt: str = HALF) -> LinkOfLoop:
+def link_of_loop(measured: Measurement, rtt: str = UP) -> LinkOfLoop:
     """The links that a measurement is, `rtt` being one of ROUND_TRIPS.
 
     The client of the measurement is taken for the AGV. What is not known of a packet is what was known before it.
