@@ -78,7 +78,8 @@ class PlantNode(LoopNode[PlantParameters]):
         self._slip = normals_of(settings.seed, SLIP)
         self._downlink_policy = DOWNLINK_POLICIES.index(settings.downlink_policy)
         self._join: MessageSync[Command] = MessageSync(self.grid.start_ns)
-        self._held = ZeroOrderHold(to_nanoseconds(settings.cmd_vel_timeout))
+        timeout_ns = to_nanoseconds(settings.cmd_vel_timeout)
+        self._held = ZeroOrderHold(timeout_ns, timeout_ns)
         self.deadline_monitor = DeadlineMonitor(self.grid.ts_ns, self.steps)
         self._lockstep = settings.clock == "lockstep"
         self._pose_out = self.output(PoseStamped, "agv/pose")
@@ -246,9 +247,10 @@ class PlantNode(LoopNode[PlantParameters]):
     # -- realtime ----------------------------------------------------------------------------------------------------
 
     def _keep_time(self) -> None:
+        # The timer first: an edge with its own clock takes the AGV's time from the pose that comes soonest.
         self.deadline_monitor.start(time.monotonic_ns())
-        self._publish()
         self.create_timer(self.settings.ts, self._tick, clock=self._steady)
+        self._publish()
 
     def _tick(self) -> None:
         due = self.deadline_monitor.tick(time.monotonic_ns())

@@ -129,7 +129,8 @@ def _as_received_at_edge_and_agv(run: Run, topics: Mapping[str, OnSteps], said: 
 
     commands = topics["agv/cmd_vel"] if len(topics.get("agv/cmd_vel", NOTHING).k) else topics["edge/cmd_vel"]
     if said is not None and said.ignored and not obeys_at_once(run):
-        commands = _not_ignored(commands, topics["agv/pose"])
+        ahead = round(run.scenario.plant.cmd_vel_timeout / run.ts)
+        commands = _not_ignored(commands, topics["agv/pose"], ahead)
     taken = _arrivals(commands, first)
     n_dl_received = np.maximum(_age(taken, ends), _dense(command_ages(run), rows))
 
@@ -213,11 +214,11 @@ def _ends(run: Run, poses: OnSteps, first: int, count: int, said: Deadlines | No
     return np.maximum.accumulate(np.clip(published, due, due + leeway))
 
 
-def _not_ignored(commands: OnSteps, poses: OnSteps) -> OnSteps:
-    """The commands that a plant took which ignored some: not those that came before their own instant."""
+def _not_ignored(commands: OnSteps, poses: OnSteps, ahead: int) -> OnSteps:
+    """The commands that a plant took which ignored some: not those that came long before their own instant."""
     if not len(commands.k):
         return commands
-    index, there = poses.at(commands.k)
+    index, there = poses.at(commands.k - ahead)
     taken = ~there | (_logs(commands) >= _logs(poses)[index])
     return commands._replace(k=commands.k[taken], messages=commands.messages[taken])
 
@@ -263,7 +264,9 @@ def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str
     if timing.is_late:
         yield from late_sentences(run, timing)
         if said is not None and said.ignored > RARE * said.steps:
-            yield f"the AGV ignored {said.ignored} commands, which came after a newer one or before their own instant"
+            yield (
+                f"the AGV ignored {said.ignored} commands: they came after a newer one, or long before their own instant"
+            )
 
 
 def late_sentences(run: Run, timing: Timing) -> Iterator[str]:

@@ -86,3 +86,18 @@ def test_against_the_rules_read_out(story: list[tuple[int, list[int]]]) -> None:
         expected = stopped(now) if newest is None or is_stopped else Command(newest, float(newest), 0.0)
         assert held.at(now) == expected
     assert held.stops == stops
+
+
+def test_a_command_that_is_a_little_early_waits_for_its_own_instant() -> None:
+    """An edge that steps by its own clock is before a tick of the AGV that comes late, or does not come at all."""
+    held = ZeroOrderHold(TIMEOUT, ahead_ns=30)
+    held.offer(Command(0, 1.0, 0.0))
+    assert held.at(0) == Command(0, 1.0, 0.0)
+    held.offer(Command(10, 2.0, 0.0))
+    held.offer(Command(20, 3.0, 0.0))
+    held.offer(Command(20, 3.0, 0.0))  # a second time
+    held.offer(Command(31, 9.0, 0.0))  # too far ahead
+    assert held.at(10) == Command(0, 1.0, 0.0)
+    held.offer(Command(10, 2.5, 0.0))  # on time, and newer than the one that waits for the same instant
+    assert [held.at(now).v for now in (20, 30)] == [2.5, 3.0]
+    assert held.outdated == 3
