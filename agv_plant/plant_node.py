@@ -247,10 +247,9 @@ class PlantNode(LoopNode[PlantParameters]):
     # -- realtime ----------------------------------------------------------------------------------------------------
 
     def _keep_time(self) -> None:
-        # The timer first: an edge with its own clock takes the AGV's time from the pose that comes soonest.
         self.deadline_monitor.start(time.monotonic_ns())
-        self.create_timer(self.settings.ts, self._tick, clock=self._steady)
         self._publish()
+        self.create_timer(self.settings.ts, self._tick, clock=self._steady)
 
     def _tick(self) -> None:
         due = self.deadline_monitor.tick(time.monotonic_ns())

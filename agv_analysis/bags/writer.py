@@ -26,6 +26,10 @@ REPLAY_OF = "replay_of"
 NODES_NAME = "agv_ncs_nodes"
 """Name of the record with what the loop's nodes said: the full name of each, and `params`, their parameters' values."""
 
+RESTART = "restart_"
+"""Of the i-th node that was started again `restart_i_from` is the stamp [ns] from which on it is another process, and
+`restart_i_params` what that said of its parameters, as a params file."""
+
 _WINDOW = 1024
 """Messages that are held back to be ordered."""
 

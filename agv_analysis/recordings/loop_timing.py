@@ -265,7 +265,7 @@ def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str
         yield from late_sentences(run, timing)
         if said is not None and said.ignored > RARE * said.steps:
             yield (
-                f"the AGV ignored {said.ignored} commands: they came after a newer one, or long before their own instant"
+                f"the AGV ignored {said.ignored} commands, which came after a newer one or long before their instant"
             )
 
 

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag
-from agv_analysis.bags.writer import METADATA_NAME, NODES_NAME, REPLAY_OF
+from agv_analysis.bags.writer import METADATA_NAME, NODES_NAME, REPLAY_OF, RESTART
 from agv_analysis.recordings.messages_on_steps import stamps_of
 from agv_analysis.run import ParameterChange
 from agv_analysis.scenario import SCHEMAS, Scenario
@@ -66,6 +67,8 @@ def said_by_nodes(bag: Bag, names: Mapping[str, str], diagnostics: str, scenario
     said = _asked(bag, record, list(_declared(bag, nodes)))
     begun = scenario.with_values(_for_all(said), f"{bag.path}: what its nodes said")
     changes = sorted(_changes(bag, names, diagnostics, nodes, begun), key=lambda change: change.k)
+    changes += _of_restarts(bag, record, begun, changes)
+    changes.sort(key=lambda change: change.k)
     first = int(stamps_of(bag[names["agv/pose"]]).min(initial=begun.grid.start_ns) - begun.grid.start_ns)
     first_k = max(0, first // begun.grid.ts_ns)
     at_start: Values = {node: {} for node in SCHEMAS}
@@ -89,6 +92,25 @@ def _asked(bag: Bag, record: Mapping[str, str], declared: list[tuple[str, str, A
             found.get(node, {}).update(_known(node, section))
     unused = {*_OF_THE_START, *(_OF_A_REPLAY if REPLAY_OF in bag.metadata.get(METADATA_NAME, {}) else ())}
     return {node: {name: v for name, v in values.items() if name not in unused} for node, values in found.items()}
+
+
+def _of_restarts(
+    bag: Bag, record: Mapping[str, str], begun: Scenario, changes: Sequence[ParameterChange]
+) -> list[ParameterChange]:
+    """What is another value in the process of a node that was started again, from the step on that it began with."""
+    found: list[ParameterChange] = []
+    for i in itertools.count(1):
+        if f"{RESTART}{i}_from" not in record:
+            return found
+        k = max(0, -((begun.grid.start_ns - int(record[f"{RESTART}{i}_from"])) // begun.grid.ts_ns))
+        sections = parse_sections(record[f"{RESTART}{i}_params"], f"{bag.path}: what its nodes said")
+        for node, section in sections.items():
+            now = as_dict(getattr(begun, node))
+            now |= {change.name: change.new for change in (*changes, *found) if change.node == node and change.k <= k}
+            for name, value in _known(node, section).items():
+                if name not in _OF_THE_START and value != now[name]:
+                    found.append(ParameterChange(k, node, name, now[name], value))
+    return found
 
 
 def _known(node: str, values: Mapping[str, Any]) -> dict[str, Any]:

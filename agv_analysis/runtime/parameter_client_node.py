@@ -20,13 +20,16 @@ _SELDOM = 100
 class ParameterClient:
     """Parameters of the node that publishes a topic, once it has appeared and has answered.
 
-    `name` is its full name, empty before it has appeared; `values` its parameters by name, None before it has answered.
+    `name` is its full name, empty before it has appeared; `values` its parameters by name, None before it has answered;
+    `again` those that it gave after it had been started again, by how often it had.
     """
 
     def __init__(self, node: Node, topic: str) -> None:
         """`node` asks; `topic` is resolved as one of its own."""
         self.name = ""
         self.values: dict[str, Any] | None = None
+        self.again: dict[int, dict[str, Any]] = {}
+        self.restarts = 0
         self._node, self._topic = node, topic
         self._list: Any = None
         self._get: Any = None
@@ -36,13 +39,22 @@ class ParameterClient:
     @property
     def is_waiting(self) -> bool:
         """Has it been asked, and has it not answered?"""
-        return self._is_sent and self.values is None
+        return self._is_sent and not self._has_answered
+
+    @property
+    def _has_answered(self) -> bool:
+        return self.values is not None and (self.restarts == 0 or self.restarts in self.again)
+
+    def ask_again(self) -> None:
+        """To be called when the node has been started again: what it says now may be something else."""
+        self.restarts += 1
+        self._is_sent, self._looks = False, 0
 
     def ask(self) -> bool:
         """Look for the node and ask it, unless it has been asked; has it answered? To be called again and again."""
         self._looks += 1
         if self._is_sent or (self._looks > _EAGER and self._looks % _SELDOM):
-            return self.values is not None
+            return self._has_answered
         if not self.name:
             self._find()
         elif self._list.service_is_ready() and self._get.service_is_ready():
@@ -67,7 +79,10 @@ class ParameterClient:
 
     def _on_values(self, names: list[str], values: list[Any]) -> None:
         found = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=False)}
-        self.values = {name: _plain(value) for name, value in found.items() if value is not None}
+        said = {name: _plain(value) for name, value in found.items() if value is not None}
+        if self.restarts:
+            self.again[self.restarts] = said
+        self.values = said if self.values is None else self.values
 
 
 def _plain(value: Any) -> Any:

@@ -21,7 +21,7 @@ from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_analysis.bags.message_definitions import schema_of
-from agv_analysis.bags.writer import NODES_NAME, BagWriter, TopicInfo
+from agv_analysis.bags.writer import NODES_NAME, RESTART, BagWriter, TopicInfo
 from agv_analysis.runtime.parameter_client_node import ParameterClient
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
@@ -31,6 +31,7 @@ from agv_ros.executor import run_node
 from agv_ros.messages import PUBLISHED
 from agv_ros.node import ENDED, LoopNode
 from agv_ros.ros_yaml import dump
+from agv_ros.stamps import NS_PER_S
 
 TOPICS: dict[str, type] = {
     "/clock": Clock,
@@ -73,6 +74,10 @@ class RecorderNode(LoopNode[RecorderParameters]):
         """By processes of nodes that were started again since."""
         self._again: Counter[str] = Counter()
         self._running: set[str] = set()
+        self._ended_ns: dict[str, int] = {}
+        """Stamp of the last step of nodes that have ended."""
+        self._begun_again: dict[str, list[int]] = {}
+        """From which stamp on nodes of the loop have been other processes."""
         agv, edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
         everywhere = [agv] if edge is agv else [agv, edge]
         one = {topic: [edge] if topic.startswith("edge/") else [agv] for topic in TOPICS}
@@ -142,6 +147,15 @@ class RecorderNode(LoopNode[RecorderParameters]):
         answered = [client.ask() for client in self._parameters_of.values()]
         return all(answered)
 
+    def _ask_again(self, name: str, stamp_ns: int) -> None:
+        """A node has been started again, and has made its first report at this stamp: what are its parameters now?"""
+        for node, client in self._parameters_of.items():
+            if client.name == f"/{name}":
+                ended_ns = self._ended_ns.pop(name, None)
+                self._begun_again.setdefault(node, []).append(stamp_ns if ended_ns is None else ended_ns + 1)
+                client.ask_again()
+                self.poll(self._ask)
+
     def _is_change(self, event: ParameterEvent) -> bool:
         """Did a node of the loop change a parameter? What it declared at its start, it says when it is asked."""
         return bool(event.changed_parameters) and any(
@@ -152,11 +166,23 @@ class RecorderNode(LoopNode[RecorderParameters]):
         """What the nodes said of their parameters, as a params file, and what they are called."""
         answered = {node: client for node, client in self._parameters_of.items() if client.values is not None}
         params = {node: {"ros__parameters": client.values} for node, client in answered.items()}
-        return {"params": dump(params), **{node: client.name for node, client in answered.items()}}
+        said = {"params": dump(params), **{node: client.name for node, client in answered.items()}}
+        restarts = [
+            (begun_ns, node, values)
+            for node, begun in self._begun_again.items()
+            for number, begun_ns in enumerate(begun, start=1)
+            if (values := self._parameters_of[node].again.get(number)) is not None
+        ]
+        for i, (begun_ns, node, values) in enumerate(sorted(restarts, key=lambda restart: restart[0]), start=1):
+            said |= {
+                f"{RESTART}{i}_from": str(begun_ns), f"{RESTART}{i}_params": dump({node: {"ros__parameters": values}}),
+            }  # fmt: skip
+        return said
 
     # -- completeness ------------------------------------------------------------------------------------------------
 
     def _note(self, diagnostics: DiagnosticArray) -> None:
+        stamp_ns = diagnostics.header.stamp.sec * NS_PER_S + diagnostics.header.stamp.nanosec
         for status in diagnostics.status:
             facts = {value.key: value.value for value in status.values}
             counts = {
@@ -166,9 +192,13 @@ class RecorderNode(LoopNode[RecorderParameters]):
             }
             if counts:
                 before = self._published.get(status.name, Counter())
-                if any(before[topic] > count for topic, count in counts.items()):  # another process of that name
+                goes_on = before and status.name not in self._running and ENDED not in facts
+                if goes_on or any(before[topic] > count for topic, count in counts.items()):  # another process
                     self._published_before += before
                     self._again[status.name] += 1
+                    self._ask_again(status.name, stamp_ns)
+                if ENDED in facts:
+                    self._ended_ns[status.name] = stamp_ns
                 self._published[status.name] = Counter(counts)
                 (self._running.discard if ENDED in facts else self._running.add)(status.name)
 

@@ -68,6 +68,9 @@ _BESIDE = (-0.5, -0.2, -0.1, -0.01, -_APART, _APART, 0.01, 0.1, 0.2, 0.5)
 _SHRINKING = 0.7
 """A distance that is below this share of what it was a quarter of the time before, on average, goes on shrinking."""
 
+_TURNS = 3.0 * math.pi
+"""Of two AGVs that meet one may have turned around once more [rad]; more turns come of a start that is left to chance."""
+
 _NOT_FAR = 1.0
 """Beyond this distance [m, m, rad] a loop may wander, and come nearer for a while."""
 
@@ -365,7 +368,9 @@ def _meets(one: Floats, other: Floats, columns: NDArray[np.int64]) -> bool:
     if len(columns) < one.shape[1]:
         return True
     apart = one - other
-    apart[:, 2] = wrapped(apart[:, 2])  # one of the two may have turned around once more
+    if abs(float(apart[-1, 2])) > _TURNS:
+        return False
+    apart[:, 2] = wrapped(apart[:, 2])
     return _is_small_or_shrinks([np.abs(apart[rows]).max(axis=1) for rows in _moments(len(apart))], _MET)
 
 
