@@ -69,7 +69,7 @@ _SHRINKING = 0.7
 """A distance that is below this share of what it was a quarter of the time before, on average, goes on shrinking."""
 
 _TURNS = 3.0 * math.pi
-"""Of two AGVs that meet one may have turned around once more [rad]; more turns come of a start that is left to chance."""
+"""Of two AGVs that meet one may have turned around once more [rad]; if more often, chance decided."""
 
 _NOT_FAR = 1.0
 """Beyond this distance [m, m, rad] a loop may wander, and come nearer for a while."""

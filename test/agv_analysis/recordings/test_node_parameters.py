@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +22,12 @@ from agv_analysis.bags.writer import NODES_NAME
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import ParameterChange
 from agv_analysis.runtime.one_process import OneProcess
+from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.runtime.runner import loop_of, run_fleet, run_loops
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.stability.driven_commands import driven_commands
-from agv_ros.executor import EXECUTORS, stop_on_signals
+from agv_cloud.controller_node import ControllerNode
+from agv_ros.executor import EXECUTORS, spin_for, stop_on_signals
 from agv_ros.params_file import parse_sections
 
 if TYPE_CHECKING:
@@ -141,8 +144,11 @@ def event(node: str, **fields: dict[str, float]) -> bytes:
     return bytes(store.serialize_cdr(message, "rcl_interfaces/msg/ParameterEvent"))
 
 
-def sample_with(path: Path, events: list[tuple[int, bytes]]) -> Path:
-    """The sample bag, which was recorded before nodes were asked, with messages of /parameter_events by log time."""
+def sample_with(path: Path, events: list[tuple[int, bytes]], said: dict[str, str] | None = None) -> Path:
+    """The sample bag, which was recorded before nodes were asked, with messages of /parameter_events by log time.
+
+    And with what nodes `said`, if anything.
+    """
     with next(SAMPLE.glob("*.mcap")).open("rb") as source, path.open("wb") as file:
         reader, writer = make_reader(source), Writer(file)
         writer.start(profile="ros2")
@@ -161,6 +167,8 @@ def sample_with(path: Path, events: list[tuple[int, bytes]]) -> Path:
             writer.add_message(own, log_time_ns, data, log_time_ns)
         for record in reader.iter_metadata():
             writer.add_metadata(record.name, record.metadata)
+        if said is not None:
+            writer.add_metadata(NODES_NAME, said)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
 
@@ -199,3 +207,45 @@ def test_a_value_that_a_node_says_and_no_schema_allows_is_left_out(tmp_path: Pat
     refused = event("/controller", new_parameters={"kx": -3.0, "v_max": 0.0})
     run = read_run(sample_with(tmp_path / "bag.mcap", [(at(0), refused)]))
     assert run.scenario == read_run(SAMPLE).scenario
+
+
+def test_a_node_that_was_started_again_says_its_parameters_again(tmp_path: Path) -> None:
+    """A controller ends after step 499 and is started with another gain; the recorder asks both."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    options: dict[str, Any] = {"context": context, "use_global_arguments": False}
+    executor = EXECUTORS["single"](context=context)
+    where = tmp_path / "bag"
+    recorder = RecorderNode(parameter_overrides=[Parameter("bag", value=str(where))], **options)
+    executor.add_node(recorder)
+    grid, client = outages().grid, recorder._parameters_of["controller"]
+
+    def until(is_done: Callable[[], bool]) -> None:
+        assert spin_for(executor, is_done, 60.0)
+
+    def one_process(kx: float, k: int, has_answered: Callable[[], bool]) -> None:
+        """A controller that reports at step k, and ends after it has been asked."""
+        controller = ControllerNode(parameter_overrides=[Parameter("kx", value=kx)], **options)
+        executor.add_node(controller)
+        until(lambda: all(output.is_heard(1) for output in controller.outputs))
+        controller.report_every_second(grid.stamp(k))
+        controller.report(grid.stamp(k))
+        until(has_answered)
+        controller.close()
+        until(lambda: not recorder._running)
+        executor.remove_node(controller)
+        controller.destroy_node()
+
+    one_process(25.0, 499, lambda: client.values is not None and bool(recorder._running))
+    one_process(50.0, 600, lambda: 1 in client.again)
+    recorder.close()
+    recorder.destroy_node()
+    context.try_shutdown()
+    said = read_bag(where, topics=()).metadata[NODES_NAME]
+    assert parse_sections(said["params"], "said")["controller"]["kx"] == 25.0
+    assert parse_sections(said["restart_1_params"], "said")["controller"]["kx"] == 50.0
+    run = read_run(sample_with(tmp_path / "sample.mcap", [], dict(said)))
+    assert run.scenario.controller.kx == 25.0
+    assert [(c.k, c.node, c.name, c.old, c.new) for c in run.parameter_changes if c.name == "kx"] == [
+        (500, "controller", "kx", 25.0, 50.0)
+    ]
