@@ -24,6 +24,11 @@ from agv_analysis.stability.scenario_loop import loop_on_lap
 _PLACES = 500
 """Places of the lap, at least, at which it is asked behind a predictor which repeated outages let an error grow."""
 
+_DIVERGED = 1e3
+"""Share of a corridor beyond which a loop without losses is not at any place."""
+
+LOOKS_AHEAD = "the law looks ahead, so that the loop's errors are not the AGV's deviation"
+
 _LONGEST_ANY = 500
 """Longest outages that are tried in sequences."""
 
@@ -171,7 +176,7 @@ def corridor(
     proved, tube, covering, why_no_tube = None, None, None, ""
     if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
         reason = "messages take time or depend on the place, so that there are not outages alone"
-    elif not math.isfinite(loop.loss_free_share):
+    elif not loop.loss_free_share < _DIVERGED:
         reason = "the loop does not settle even without losses"
     else:
         progress("single outages")
@@ -210,6 +215,8 @@ def _longest_any(single: SingleOutage) -> int:
 
 def _tubes(loop: LapLoop, longest: int) -> tuple[int | None, Tube | None, Tube | None, str]:
     """The largest n that is proved, its tube, that with the second order, and why there is none."""
+    if loop.scenario.controller.steps_ahead:
+        return None, None, None, LOOKS_AHEAD
     try:
         linear = loop_on_lap(loop.scenario)
     except NoNominalMotionError as error:
@@ -229,6 +236,8 @@ def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:
         return None, "the uplink is no Markov chain that alone loses messages"
     if scenario.plant.slip_noise > 0.0:
         return None, "slip is random"
+    if scenario.controller.steps_ahead:
+        return None, LOOKS_AHEAD
     try:
         return stationary_deviation(loop, loop_on_lap(scenario), chain), ""
     except NoNominalMotionError as error:
@@ -253,7 +262,7 @@ def _growing(loop: LapLoop, longest: int) -> int | None:
 
 def _notes(loop: LapLoop, single: SingleOutage | None) -> Iterator[str]:
     share, policy = loop.loss_free_share, loop.scenario.error_detector.policy
-    if share > 1.0 and math.isfinite(share):
+    if 1.0 < share < _DIVERGED:
         yield f"without any outage the AGV uses {share:.3g} times the half-width: no outage can be survived in it"
     elif single is not None and single.n == 0 and policy == "hold":
         yield (

@@ -15,8 +15,8 @@ from agv_analysis.simulation.loop import Loop, Rows, RunInputs, compared_referen
 from agv_analysis.simulation.parts import replacements_of
 from agv_plant.random_stream import DRAWS
 
-_BASE, _LONGEST = 200_000, 100_000
-"""Slots of the run that looks for the first level, and those that others may last longer."""
+_BASE, _LONGEST = 200_000, 20_000
+"""Slots of the run that looks for the first level, and those that others may last."""
 
 _RUNS, _FEWEST, _MOST = 8000, 100, 1000
 """Runs of a replicate in all, and from each level at least and at most."""

@@ -30,6 +30,9 @@ from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.parts import run_parts
 from agv_ros.substitution import Replacements
 
+FEW = 0.02
+"""Share of the runs from a level up to which it does not matter that they were ended; with more there is no estimate."""
+
 REPLICATES = 16
 """Independent estimates of which the mean is taken."""
 
@@ -45,7 +48,7 @@ class Work(NamedTuple):
     trials: int
     """Runs from each level to the next."""
     longest: int
-    """Slots after the end of that run at which a run that has neither reached a level nor come home is ended."""
+    """Slots after which a run that has neither reached a level nor come home is ended."""
 
 
 def advance(state: Any, lost: bool, k: int, rng: Any, process: Any) -> tuple[Any, float, bool]:
@@ -102,6 +105,7 @@ def split(
         for trial in range(work.trials):
             pick = min(len(entries) - 1, int((trial + rng.random()) * len(entries) / work.trials))
             state, k, channel, importance = entries[pick]
+            last = min(k + work.longest, work.base + work.longest)
             is_over = importance >= levels[level]
             if is_over:
                 hits[level] += 1.0
@@ -117,9 +121,11 @@ def split(
                     is_over = True
                 elif is_fresh and importance < levels[0]:
                     is_over = True
-                elif k >= work.base + work.longest:
+                elif k >= last:
                     ended += 1
                     is_over = True
+            if ended > FEW * work.trials:
+                return ended
         entries = reached
     return ended
 
@@ -130,7 +136,7 @@ class Rate(NamedTuple):
     per_slot: Estimate
     """Expected number of events in a slot, with its 95 % interval."""
     ended: int
-    """Runs that were ended without having reached a level or home."""
+    """Runs that were ended without having reached a level or home; if they are many, the rate is unknown."""
     runs: int
     """All runs."""
 
@@ -156,7 +162,7 @@ def rate_of(
     rates = found[:, 0] / work.base * np.prod(found[:, 1:] / work.trials, axis=1)
     mean, spread = float(rates.mean()), float(rates.std(ddof=1)) / math.sqrt(REPLICATES)
     runs = REPLICATES * work.trials * (len(levels) - 1)
-    if mean == 0.0:
+    if mean == 0.0 or ended.max() > FEW * work.trials:
         return Rate(Estimate(0.0, 0.0, 1.0), int(ended.sum()), runs)
     # Products of estimates are skew: their logarithm is nearer to a normal number than they are.
     factor = math.exp(min(_STUDENT * spread / mean, 700.0))
