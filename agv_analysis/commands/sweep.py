@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import with_report, with_settings
-from agv_analysis.sweep import METRICS, MOST_POINTS
+from agv_analysis.commands import corridor_settings, with_corridor, with_report, with_settings
+from agv_analysis.sweep import CORRIDOR_COLUMNS, METRICS, MOST_POINTS
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,14 +23,16 @@ _LONGEST_TABLE = 40
 
 @click.command("sweep")
 @with_settings
+@with_corridor
 @click.option(
     "--vary", "axes", multiple=True, required=True, metavar="NODE.PARAMETER=VALUES",
     help="What to vary: first:last:count, evenly spaced, or a,b,c. May be repeated: all combinations are run.",
 )  # fmt: skip
 @click.option("--seeds", type=int, default=1, show_default=True, help="How many, counted from relay.seed on.")
 @click.option(
-    "--metric", "metrics", multiple=True, type=click.Choice(["instability", *METRICS]), default=["instability"],
-    show_default=True, help="What to draw; of the others the median over the seeds. May be repeated.",
+    "--metric", "metrics", multiple=True, type=click.Choice(["instability", *METRICS, *CORRIDOR_COLUMNS]),
+    default=["instability"], show_default=True,
+    help="What to draw; of the others the median over the seeds, or what is said of the --corridor. May be repeated.",
 )  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path), help="Keep results and pictures in this directory.")
 @click.option("--format", "suffix", type=click.Choice(["csv", "parquet"]), default="csv", show_default=True)
@@ -45,6 +47,9 @@ _LONGEST_TABLE = 40
 def command(
     params: str,
     settings: tuple[str, ...],
+    corridor_width: float | None,
+    corridor_along: float | None,
+    laps: int | None,
     axes: tuple[str, ...],
     seeds: int,
     metrics: tuple[str, ...],
@@ -69,17 +74,20 @@ def command(
       agv-ncs sweep config/outages.yaml --vary controller.kx=5,25,250 --seeds 20
       agv-ncs sweep config/paper.yaml --set relay.uplink.model=bernoulli --vary controller.kx=5:400:40
         --vary relay.uplink.p=0:0.95:20 --seeds 200 --out sweeps/gain
+      agv-ncs sweep config/outages.yaml --vary controller.kx=2:50:9 --corridor 0.25 --metric p_hour --out sweeps/metres
       (the same with --resume goes on where Ctrl-C stopped it)
     """
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.scenario import load_scenario
     from agv_analysis.sweep.collect import collect
+    from agv_analysis.sweep.corridors import has_corridor, with_corridors
     from agv_analysis.sweep.plan import Sweep, SweepError, parse_axis
     from agv_analysis.sweep.store import Store
     from agv_analysis.sweep.verdicts import with_verdicts
 
     if resume and out is None:
         raise SweepError("--resume goes on with a sweep in a directory: name it by --out")
+    settings = (*settings, *corridor_settings(corridor_width, corridor_along))
     sweep = Sweep(load_scenario(params, settings), tuple(map(parse_axis, axes)), seeds)
     sweep.check()
     store = None if out is None else Store(out, sweep, resume)
@@ -96,6 +104,11 @@ def command(
             complete = False
             rows = with_verdicts(sweep, rows, workers, progress)
             complete = True
+    if complete and has_corridor(sweep):
+        with step_bar(len(rows), "within the corridor") as progress, suppress(KeyboardInterrupt):
+            complete = False
+            rows = with_corridors(sweep, rows, laps, progress)
+            complete = True
     _write_rows(sweep, rows, metrics, out, suffix)
     _write_reports(sweep, rows, report, figures)
     if not complete:
@@ -110,6 +123,7 @@ def _write_rows(
     sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], out: Path | None, suffix: str
 ) -> None:
     from agv_analysis.sweep.picture import can_draw, draw
+    from agv_analysis.sweep.plan import SweepError
     from agv_analysis.sweep.rows_file import write_rows
 
     if len(rows) <= _LONGEST_TABLE:
@@ -119,7 +133,9 @@ def _write_rows(
     write_rows(rows, out / f"points.{suffix}")
     click.echo(f"points:  {out / f'points.{suffix}'}")
     for metric in metrics if can_draw(sweep) else ():
-        column = metric if metric == "instability" else f"{metric}_p50"
+        column = f"{metric}_p50" if metric in METRICS else metric
+        if column not in rows[0]:
+            raise SweepError(f"--metric {metric} is of a corridor: name one by --corridor")
         draw(sweep, rows, column, out / f"{metric}.png")
         click.echo(f"picture: {out / f'{metric}.png'}")
 
@@ -165,12 +181,34 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     if rows and "verdict" in rows[0]:
         console.print(_verdicts(sweep, rows))
         console.print(f"Verdicts: {counted(rows)}")
+    if rows and "p_lap" in rows[0]:
+        console.print(_corridors(sweep, rows))
     unsaid = sum(row["undecided"] for row in rows)
     if unsaid:
         console.print(
             f"[bold yellow]Undecided:[/] {unsaid} runs are shorter than the transient of the loop without losses, "
             "so twins that are not closer by their end say nothing; make plant.duration longer."
         )
+
+
+def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
+    """What each point does within its corridor, the best one marked."""
+    from rich.table import Table
+
+    from agv_analysis.sweep.corridors import best_for_corridor
+
+    table, best = Table(box=None, pad_edge=False), best_for_corridor(sweep, rows)
+    for axis in sweep.axes:
+        table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
+    for name in ("single\noutage", "any\noutages", "leaves in a lap", "leaves in an hour", "mean time [s]", ""):
+        table.add_column(name, justify="right")
+    for row in rows:
+        table.add_row(
+            *(_plain(row[axis.name]) for axis in sweep.axes), f"{row['n_single']:g}", f"{row['n_any']:g}",
+            f"{row['p_lap']:.3g} ({row['p_lap_low']:.2g} .. {row['p_lap_high']:.2g})", f"{row['p_hour']:.3g}",
+            f"{row['mean_time_s']:.3g}", "most rarely" if row is best else "",
+        )  # fmt: skip
+    return table
 
 
 def _verdicts(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:

@@ -162,18 +162,19 @@ class Corridor:
 
 
 def corridor(
-    scenario: Scenario, laps: int | None = None, progress: Callable[[str], None] = lambda what: None
-) -> Corridor | None:
+    scenario: Scenario, laps: int | None = None, progress: Callable[[str], None] = lambda what: None,
+    proved: bool = True,
+) -> Corridor | None:  # fmt: skip
     """What a scenario's loop does within its corridor; None if it has none.
 
-    `laps` are simulated, or as many as usual. Raises TrackFileError if the track's file cannot be used, PartError if a
-    part raises.
+    `laps` are simulated, or as many as usual; without `proved` there is no tube. Raises TrackFileError if the track's
+    file cannot be used, PartError if a part raises.
     """
     widths = widths_of(scenario.error_detector)
     if widths is None:
         return None
     loop, single, sequence, n_any, why, reason = LapLoop(scenario, widths), None, None, None, "", ""
-    proved, tube, covering, why_no_tube = None, None, None, ""
+    n_proved, tube, covering, why_no_tube = None, None, None, "" if proved else "not asked for"
     if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
         reason = "messages take time or depend on the place, so that there are not outages alone"
     elif not loop.loss_free_share < _DIVERGED:
@@ -183,12 +184,13 @@ def corridor(
         single = single_outage(loop)
         progress("sequences of outages")
         n_any, sequence, why = _any_outages(loop, single)
-        progress("a tube for any outages")
-        proved, tube, covering, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
+        if proved:
+            progress("a tube for any outages")
+            n_proved, tube, covering, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
     progress("laps")
     found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"))
     return Corridor(
-        widths, loop.ts, single, sequence, n_any, why, proved, tube, covering, why_no_tube, *_stationary(loop), found,
+        widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, *_stationary(loop), found,
         loop.steps, reason, tuple(_notes(loop, single)),
     )  # fmt: skip
 

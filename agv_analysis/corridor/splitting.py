@@ -31,7 +31,7 @@ from agv_analysis.simulation.parts import run_parts
 from agv_ros.substitution import Replacements
 
 FEW = 0.02
-"""Share of the runs from a level up to which it does not matter that they were ended; with more there is no estimate."""
+"""Share of the runs from a level up to which it does not matter that they were ended; with more there is no rate."""
 
 REPLICATES = 16
 """Independent estimates of which the mean is taken."""
