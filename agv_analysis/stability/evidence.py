@@ -21,12 +21,12 @@ from agv_analysis.stability.confidence.link_confidence import LinkConfidence, li
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import largest_n, longest_for
 from agv_analysis.stability.criteria.criterion import PLACES_OF_LONG_LAP, Judgement, RunFacts, has_late
-from agv_analysis.stability.criteria.late_and_lost import growths_of_halves
+from agv_analysis.stability.criteria.late_and_lost import growth_of_channel, growths_of_halves
 from agv_analysis.stability.driven_commands import DrivenCommands, driven_commands, scenarios_of
 from agv_analysis.stability.empirical import with_an_end
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.repeated_run import RepeatedRun, is_disturbed, repeated_run
-from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, UNSTABLE, Evidence, Verdict, decide, weakest
+from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, SURE, UNSTABLE, Evidence, Verdict, decide, weakest
 from agv_cloud.reference.reference import lap_steps
 
 _TIMES_AS_FAR = 2.0
@@ -191,6 +191,10 @@ def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Jud
     """With the growth under the links of a scenario; as a run of it shows them where one of them is no finite chain."""
     run, relay, policy = facts.run, facts.run.scenario.relay, facts.run.scenario.plant.downlink_policy
     uplink, downlink = chain_of(relay.uplink), chain_of(relay.downlink)
+    if facts.is_late and _constant_delay(facts) is None:
+        of_channel = growth_of_channel(facts.loop, relay, run.ts)
+        if isinstance(of_channel, float):
+            return _with_growth(replace(common, is_unlimited=True), of_channel, "late_and_lost")
     if facts.is_late or uplink is None or downlink is None:
         return _under_links_as_seen(common, facts, judgements)
     if downlink.loss_rate == 0.0:
@@ -212,12 +216,16 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
     run, delay = facts.run, _constant_delay(facts)
     if delay is not None:
         radius = lifted.largest_radius(facts.loop.thinned(PLACES_OF_LONG_LAP), delay)
-        return replace(common, n=delay, late_by=delay, lifted_radius=radius)
+        unsure = _left_open_by_losses(facts)
+        probability = 0.5 if unsure else 1.0
+        return replace(
+            common, n=delay, late_by=delay, lifted_radius=radius, probability_stable=probability, seen=unsure
+        )  # fmt: skip
     late, of_ages = judgements.get("late_and_lost"), judgements["recorded_losses"].stable
     if late is not None and not run.is_late:
         growth = late.detail
         agree = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
-        unsure = "" if agree else "the halves of the run do not agree"
+        unsure = _left_open_by_losses(facts) if agree else "the halves of the run do not agree"
         if has_late(run.downlink) and of_ages is not (growth < 0.0):  # ages that add up are no chain of their own
             unsure = "the chain of ages and these very ages do not agree"
         return _with_growth(common, growth, "late_and_lost", unsure)
@@ -229,6 +237,15 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
     if of_ages is not None:
         why += f"; under these very ages a small error {'shrinks' if of_ages else 'grows'}"
     return replace(common, not_covered=why)
+
+
+def _left_open_by_losses(facts: RunFacts) -> str:
+    """Why a late run cannot be called stable, if its losses alone, without their delays, do not allow it."""
+    run = facts.run
+    if _loses_nothing(run) or run.downlink_lost.any():
+        return ""
+    alone = link_confidence(facts.loop, run.k, run.lost, run.ts)
+    return "" if alone.probability_stable >= SURE else f"of the losses alone, without their delays: {alone.reason}"
 
 
 def _with_growth(common: Evidence, growth: float, growth_of: str = "mean_square", unsure: str = "") -> Evidence:

@@ -218,6 +218,8 @@ def _mean_square(evidence: Evidence) -> Verdict:
 
 def _late(evidence: Evidence) -> Verdict:
     age = f"each pose is {evidence.late_by} steps old when its command acts"
+    if evidence.lifted_radius < 1.0 and evidence.probability_stable < SURE:
+        return _undecided(evidence)
     if evidence.lifted_radius < 1.0:
         shrinks = f"{age}, and the error shrinks"
         return Verdict(ASYMPTOTIC, "lifted", f"{shrinks}; see n_max of stability", shrinks)

@@ -17,6 +17,7 @@ from agv_analysis.stability.criteria.criterion import (
     has_late,
 )
 from agv_analysis.stability.linear_loop import LinearLoop
+from agv_plant.parameters import RelayParameters
 
 _PLACES, _FEWEST, _WORK = 2000, 50, 2e7
 """Places of a lap at which a run is judged, at most and at least, and numbers to be moved over them, see `work`."""
@@ -72,23 +73,26 @@ def _judge(facts: RunFacts) -> Judgement | None:
     )  # fmt: skip
 
 
+def growth_of_channel(loop: LinearLoop, relay: RelayParameters, ts: float) -> float | str:
+    """Growth of E[e^2] per step of `loop` under the late uplink of a scenario; in words why there is no answer."""
+    if relay.downlink.delays or relay.downlink.model != "perfect":
+        return "commands are late or lost as well"
+    ages = age_chain_of(relay.uplink, ts)
+    if ages is None:
+        return "losses with a memory and random delays, or a channel that is no finite Markov chain"
+    return _why_not(loop, ages) or delayed_mean_square.lap_growth(loop, ages) / loop.steps
+
+
 def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     relay, ts = facts.scenario.relay, facts.scenario.plant.ts
     if not relay.uplink.delays:
         yield Margin(_NAME, _LABEL, None, reason="the uplink delays nothing", shown=False)
         return
-    ages, reason = age_chain_of(relay.uplink, ts), ""
-    if relay.downlink.delays or relay.downlink.model != "perfect":
-        reason = "no answer: commands are late or lost as well"
-    elif ages is None:
-        reason = "no answer: losses with a memory and random delays, or a channel that is no finite Markov chain"
-    elif why := _why_not(facts.loop, ages):
-        reason = f"no answer: {why}"
-    if reason or ages is None:
-        yield Margin(_NAME, _LABEL, None, reason=reason)
-        return
-    growth = delayed_mean_square.lap_growth(facts.loop, ages) / facts.loop.steps
-    yield Margin(_NAME, _LABEL, finite(growth), growth_text(growth))
+    found = growth_of_channel(facts.loop, relay, ts)
+    if isinstance(found, str):
+        yield Margin(_NAME, _LABEL, None, reason=f"no answer: {found}")
+    else:
+        yield Margin(_NAME, _LABEL, finite(found), growth_text(found))
 
 
 CRITERION = Criterion(

@@ -284,3 +284,19 @@ def test_the_reason_of_an_unstable_word_is_no_reason_for_doubt() -> None:
     found = link_confidence(loop_of_run(run), run.k, lost, run.ts)
     assert found.probability_stable < 0.05
     assert "may not exist" not in found.reason
+
+
+@pytest.mark.parametrize("delay", [0.005, 0.01, 0.02])
+def test_a_known_channel_behind_a_delay_is_not_judged_by_the_one_lap_that_it_was_simulated_for(delay: float) -> None:
+    """Mean age 9.6 slots without the delay, where K_x = 25 allows 7.5; most laps of 100 s see two or three outages."""
+    r, rate = 1.0 / 300.0, 0.032
+    link = ("relay.uplink.model=gilbert_elliott", f"relay.uplink.p={r * rate / (1.0 - rate)}", f"relay.uplink.r={r}")
+    assert rate * 300.0 > 1.0 / 0.125 - 0.5
+    assert decide(evidence_of_scenario(scenario_of(*link, f"relay.uplink.delay={delay}"))).word not in GREEN
+
+
+def test_a_late_recording_with_hardly_an_outage_is_as_undecided_as_one_in_time() -> None:
+    few = ("relay.uplink.model=gilbert_elliott", "relay.uplink.p=0.0001", "relay.uplink.r=0.0033")
+    in_time, late = of(*few), of(*few, "relay.uplink.delay=0.01")
+    assert in_time.outages.uplink.count == late.outages.uplink.count <= 2
+    assert in_time.verdict.word == late.verdict.word == "undecided"
