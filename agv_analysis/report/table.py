@@ -89,9 +89,9 @@ def headline_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     """The verdict, how far the AGV strays and how much more it can take, each in a short line with rich's markup."""
     from rich.markup import escape
 
-    if analysis.run.unexplained or not isinstance(analysis, Analysis):
+    if not isinstance(analysis, Analysis):
         yield "Verdict", f"[bold yellow]none[/]: {in_short(analysis)}"
-    else:
+    elif not analysis.run.unexplained:  # of one that proves nothing this is said before, and it is not judged
         verdict, said = analysis.verdict, in_short(analysis)
         yield "Verdict", f"[bold {colour_of(verdict.word)}]{said[0].upper()}{said[1:]}[/]"
         if verdict.word not in GREEN:
