@@ -175,7 +175,7 @@ def _topic(bag: Bag, topic: Topic) -> TopicSummary:
     clock = stamp_clock(rows) if rows is not None and len(rows) else None
     return TopicSummary(
         topic.name, topic.type, topic.count, topic.encoding, topic.definition, *periods_of(times), clock,
-        _not_finite(rows) if rows is not None else {},
+        _not_finite(rows) if rows is not None and len(rows) else {},
     )  # fmt: skip
 
 

@@ -62,6 +62,19 @@ def test_the_clock_of_the_stamps(tmp_path: Path) -> None:
     assert clock.spread == pytest.approx(0.9 * 2e-3, rel=0.05)
 
 
+def test_a_topic_of_which_no_message_can_be_read_has_no_times(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        text = b"float64[9] values"
+        channel = writer.register_channel("/a", "cdr", writer.register_schema("my_msgs/msg/A", "ros2msg", text))
+        writer.add_message(channel, 5, b"\0\1\0\0" + bytes(9), 5)
+        writer.finish()  # type: ignore[no-untyped-call]
+    (topic,) = describe(read_bag(path)).topics
+    assert (topic.messages, topic.first, topic.not_finite) == (1, None, {})
+
+
 def test_messages_without_a_stamp_have_no_clock(tmp_path: Path) -> None:
     pairs = [(10**9 + k, 0) for k in range(50)]
     assert describe(read_bag(write(tmp_path / "a.mcap", {"/a": pairs}))).topics[0].clock is None
