@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TextIO
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,19 +78,19 @@ def export_npz(bag: Bag, out: Path) -> list[Path]:
 
 def export_tum(bag: Bag, out: Path) -> list[Path]:
     """One TUM trajectory for each topic with poses, and each frame of /tf, in the directory `out`. Raises BagError."""
-    found = {
-        out / f"{_file_name(topic)}{f'.{_file_name(item.name)}' if item.name else ''}.tum": item
+    found = [
+        (out / f"{_file_name(topic)}{f'.{_file_name(item.name)}' if item.name else ''}.tum", item)
         for topic, rows in bag.arrays.items()
         for item in trajectories_of(rows)
-    }
+    ]
     if not found:
         raise BagError(f"{bag.path}: no topic with poses: {', '.join(bag.arrays) or 'no topic at all'}")
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        for path, trajectory in found.items():
+        for path, trajectory in found:
             with _new(path) as file:
                 file.writelines(f"{line}\n" for line in trajectory.lines())
-    return list(found)
+    return [path for path, _ in found]
 
 
 EXPORTS: dict[str, Callable[[Bag, Path], list[Path]]] = {
@@ -124,8 +125,9 @@ def _for_each_topic(
     return list(paths.values())
 
 
-def _file_name(topic: str) -> str:
-    return topic.strip("/").replace("/", ".")
+def _file_name(name: str) -> str:
+    """Name of a file for a topic or frame, whatever characters a bag has in it."""
+    return quote(name.strip("/").replace("/", "."), safe="")
 
 
 def _new(path: Path) -> TextIO:

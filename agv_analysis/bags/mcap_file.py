@@ -125,8 +125,12 @@ class McapFile:
         self._is_proven = False
         self._damages = 0
         self._source = Source(path)
-        self._check_magic()
-        self._read_summary()
+        try:
+            self._check_magic()
+            self._read_summary()
+        except BagError:
+            self.close()
+            raise
 
     @property
     def schemas(self) -> dict[int, Schema]:

@@ -46,7 +46,9 @@ def trajectories_of(rows: NDArray[np.void]) -> Iterator[Trajectory]:
             columns = [f"{prefix}{place}.{axis}" for axis in _AXES] + [
                 f"{prefix}{turn}.{axis}" for axis in (*_AXES, "w")
             ]
-            if prefix != name and all(column in names for column in columns):
+            forms = {rows.dtype[column] for column in columns if column in names}
+            is_whole = prefix != name and all(column in names for column in columns)
+            if is_whole and len(forms) == 1 and forms.pop().base.kind == "f":
                 yield from _of_columns(rows, prefix, columns)
                 return
 
@@ -61,11 +63,11 @@ def _of_columns(rows: NDArray[np.void], prefix: str, columns: list[str]) -> Iter
     # An array of transforms, as on /tf: a trajectory for each child frame.
     names, array = rows.dtype.names or (), prefix.partition(".")[0]
     lengths = rows[length_path(array)] if length_path(array) in names else np.full(len(rows), poses.shape[1])
+    child = f"{array}.child_frame_id"
+    if child not in names or lengths.ndim > 1 or rows[child].shape != poses.shape[:2]:
+        return
     is_there = np.arange(poses.shape[1]) < lengths[:, None]
     times, poses = _stamps(rows, f"{array}.", poses.shape[1])[is_there], poses[is_there]
-    child = f"{array}.child_frame_id"
-    if child not in names:
-        return
     frames = rows[child][is_there]
     for frame in np.unique(frames):
         mine = frames == frame

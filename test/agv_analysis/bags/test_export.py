@@ -12,6 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.bags import read_bag
 from agv_analysis.bags.column_notes import Note, column_notes
+from agv_analysis.bags.export import export_csv
 from agv_analysis.bags.trajectories import trajectories_of
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -85,3 +86,17 @@ def test_transforms_are_trajectories_by_frame(tmp_path: Path) -> None:
     assert list(arm.lines()) == ["7.000000001 1.0 2.0 3.0 0.0 0.0 0.0 1.0", "7.000000005 5.0 2.0 3.0 0.0 0.0 0.0 1.0"]
     assert base.times.tolist() == [7 * 10**9 + k for k in range(6)]
     assert base.poses[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_names_that_are_no_file_names_are_encoded(tmp_path: Path) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        for number, topic in enumerate(["/../../up", "a\0b", "a b", "a_b"]):
+            schema = writer.register_schema("std_msgs/msg/Int32", "ros2msg", b"int32 data")
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, number, b"\0\1\0\0" + bytes(4), number)
+        writer.finish()  # type: ignore[no-untyped-call]
+    paths = export_csv(read_bag(tmp_path / "a.mcap"), tmp_path / "out")
+    assert sorted(path.name for path in paths) == sorted(["......up.csv", "a%00b.csv", "a%20b.csv", "a_b.csv"])
+    assert {path.parent for path in paths} == {tmp_path / "out"}
