@@ -10,7 +10,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test coverage bench docs sample clean
+.PHONY: demo test coverage bench fuzz docs sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -28,6 +28,9 @@ coverage: test
 
 bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
 	$(BIN)/python -m benchmarks $(BENCH)
+
+fuzz: $(VENV)/test.stamp ## damaged bags against independent readers, a million over night; CASES=1000 for fewer
+	nice $(BIN)/python -m fuzz --cases $(or $(CASES),1000000) --json fuzz.json --save fuzz_failures
 
 docs: $(VENV)/run.stamp ## bring README.md and docs/ up to date with the code
 	$(BIN)/python docs/update.py
