@@ -134,6 +134,7 @@ def _link_of(
     from agv_analysis.link.formats.format import Options
     from agv_analysis.link.link_figures import LinkFigures
     from agv_analysis.link.markov_channel import chain_of
+    from agv_analysis.link.measured_trace import of_trace
     from agv_analysis.link.measurement import LossRates, Measurement
     from agv_analysis.requirements.link_availability import of_channel, of_measurement
     from agv_ros.errors import UserError
@@ -148,6 +149,9 @@ def _link_of(
             survival = loop.survival_time
             return None if survival is None or survival < 0.0 else of_measurement(LinkFigures(reading), survival)
         uplink = reading.channel
+    if uplink.model == "trace" and loop.survival_time is not None and loop.survival_time >= 0.0:
+        figures = LinkFigures(of_trace(uplink.trace_file, "uplink", scenario.plant.ts))
+        return of_measurement(figures, loop.survival_time)
     chain = chain_of(uplink)
     if slots is None or slots < 0 or chain is None:
         return None

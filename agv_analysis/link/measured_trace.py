@@ -9,6 +9,7 @@ import numpy as np
 
 from agv_analysis.link.measurement import LOST, RECEIVED, Measurement, PacketOutcomes
 from agv_analysis.run import Floats
+from agv_plant.channels.timed_trace import read_trace
 from agv_ros.errors import UserError
 
 UP, DOWN, HALF = "up", "down", "half"
@@ -100,6 +101,21 @@ def _increasing(sent: Floats) -> Floats:
     """Times [s] that increase by a microsecond at least: stamps may be coarser than packets are apart."""
     steps = np.maximum(np.diff(sent), 1e-6)
     return np.concatenate(([0.0], np.cumsum(steps))) if np.any(np.diff(sent) < 1e-6) else sent - sent[0]
+
+
+def of_trace(file: str, link: str, ts: float) -> Measurement:
+    """What a file for the channel `trace` says of a link, as a measurement; a row without a time is a slot of `ts` [s].
+
+    Raises TraceError for a file that cannot be used.
+    """
+    found = read_trace(file, link)
+    sent = np.arange(len(found.lost), dtype=np.float64) * ts if found.time is None else found.time
+    delay = None if found.delay is None else np.where(found.lost, np.nan, found.delay)
+    packets = PacketOutcomes(np.where(found.lost, LOST, RECEIVED).astype(np.int8), delay)
+    is_uplink = link != "downlink"
+    return Measurement(
+        file, "trace", sent, uplink=packets if is_uplink else None, downlink=None if is_uplink else packets
+    )
 
 
 def write_trace(path: Path, link: LinkOfLoop) -> None:

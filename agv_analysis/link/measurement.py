@@ -22,6 +22,9 @@ would have answered was lost."""
 
 Codes = NDArray[np.int8]
 
+_SPARSE, _MOST_MISSING = 1000, 1_000_000
+"""A series of numbered packets may lack so many for each that is there, and so many more."""
+
 _SHOWN = 3
 """Malformed lines that are shown."""
 
@@ -189,9 +192,15 @@ class Grid:
 def on_grid(found: Numbered, first: int, last: int, interval: float) -> Grid:
     """All packets from number `first` to number `last`, those without a record as lost.
 
-    Times that the file does not have are interpolated by number; without any, packets are `interval` [s] apart.
+    Times that the file does not have are interpolated by number; without any, packets are `interval` [s] apart. Raises
+    MeasurementError for numbers that can be none of a sequence.
     """
     count = last - first + 1
+    if count > _SPARSE * len(found.seq) + _MOST_MISSING:
+        raise MeasurementError(
+            f"numbers go from {first} to {last}, and {len(found.seq)} packets have one: these are no sequence numbers, "
+            "or one of them is broken"
+        )
     rows = found.seq - first
     is_known = (rows >= 0) & (rows < count)
     record = np.full(count, -1, dtype=np.int64)

@@ -303,6 +303,10 @@ def _arrivals(values: dict[str, Floats], sent: Floats) -> Floats | None:
 
 def _by_number(source: str, values: dict[str, Floats], malformed: Malformed, options: Options) -> Measurement:
     """Rows are what was received; a number without a row was lost."""
+    numbered = np.isfinite(values["seq"])
+    malformed.count += int(np.count_nonzero(~numbered))
+    values = {role: column[numbered] for role, column in values.items()}
+    needs_packets(len(values["seq"]), source, "row with a number")
     seq = values["seq"].astype(np.int64)
     delays = [role for role in ("delay", "rtt") if role in values]
     given = tuple(values[role] for role in delays)
@@ -315,10 +319,10 @@ def _by_number(source: str, values: dict[str, Floats], malformed: Malformed, opt
         seq = unwrapped(seq, _MODULUS)
     times = values.get("sent", values.get("time"))
     interval = options.interval or 1.0
-    numbered = Numbered(
+    found = Numbered(
         seq[received], tuple(column[received] for column in given), None if times is None else times[received]
     )
-    grid = on_grid(numbered, int(seq.min()), int(seq.max()), interval)
+    grid = on_grid(found, int(seq.min()), int(seq.max()), interval)
     notes = ["a number without a row is taken for lost; packets before the first and after the last are unknown"]
     if times is None:
         said = "as --interval says" if options.interval else "assumed; say otherwise with --interval"

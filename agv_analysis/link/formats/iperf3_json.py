@@ -69,7 +69,11 @@ def _sum(content: dict[str, Any]) -> list[Row]:
 def _row(found: dict[str, Any]) -> Row | None:
     if found.get("omitted") or not found.get("packets") or "lost_packets" not in found:
         return None
-    return float(found["start"]), float(found["end"]), int(found["packets"]), int(found["lost_packets"])
+    try:
+        row = float(found["start"]), float(found["end"]), int(found["packets"]), int(found["lost_packets"])
+    except (KeyError, TypeError, ValueError):
+        return None
+    return row if row[1] > row[0] and 0 <= row[3] <= row[2] else None
 
 
 FORMAT = Format("iperf3", "JSON of iperf3 -u -J", 20, _matches, _read)

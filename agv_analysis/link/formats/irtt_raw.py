@@ -43,6 +43,9 @@ def _matches(head: bytes, path: Path) -> bool:
 def _read(path: Path, options: Options) -> Measurement:
     malformed = Malformed()
     table = rows_of_words(path, _COLUMNS, malformed, options.progress, _WANTED)
+    unnumbered = np.isnan(table[:, 0])
+    malformed.count += int(np.count_nonzero(unnumbered))
+    table = table[~unnumbered]
     needs_packets(len(table), str(path), "line of a reply")
     again = table[:, 4] == 1.0
     table, duplicates = table[~again], int(np.count_nonzero(again))

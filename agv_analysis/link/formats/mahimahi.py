@@ -27,6 +27,9 @@ _USUAL_INTERVAL = 0.005
 
 _MS = 1e-3
 
+_MOST = 100_000_000
+"""Packets that are asked about, at most."""
+
 
 def _matches(head: bytes, path: Path) -> bool:
     lines = head.splitlines()
@@ -45,6 +48,8 @@ def _read(path: Path, options: Options) -> Measurement:
     if np.any(np.diff(at) < 0.0) or not at[-1] > 0.0:
         raise MeasurementError(f"{path}: times of a mahimahi trace must not decrease, and end behind 0")
     interval = options.interval or _USUAL_INTERVAL
+    if at[-1] * _MS / interval > _MOST:
+        raise MeasurementError(f"{path}: lasts {at[-1] * _MS:g} s, too long for a packet every {interval:g} s")
     count = max(1, int(np.floor(at[-1] * _MS / interval + 1e-9)))
     sent = np.arange(count, dtype=np.float64) * interval
     opportunities = np.append(at, at[0] + at[-1]) * _MS

@@ -12,7 +12,7 @@ import pytest
 
 from agv_analysis.link.formats import read_link
 from agv_analysis.link.link_figures import LinkFigures
-from agv_analysis.link.measured_trace import HALF, ROUND_TRIPS, link_of_loop, write_trace
+from agv_analysis.link.measured_trace import HALF, ROUND_TRIPS, link_of_loop, of_trace, write_trace
 from agv_analysis.link.measurement import LOST, NOT_SENT, RECEIVED, UNKNOWN, Measurement, PacketOutcomes
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.scenario import load_scenario
@@ -90,6 +90,16 @@ def test_what_was_never_sent_is_no_loss_of_the_downlink() -> None:
     assert link.downlink_lost.tolist() == [True, True, True, False]  # as it was before
     rate = LinkFigures(found).to_json()["downlink"]["loss_rate"]
     assert rate["value"] == 0.5
+
+
+def test_a_trace_is_a_measurement_again(tmp_path: Path) -> None:
+    path, rows = tmp_path / "trace.csv", tmp_path / "rows.csv"
+    write_trace(path, link_of_loop(of_round_trips([0, 1, 1, 0], 0.01)))
+    found = of_trace(str(path), "uplink", 0.005)
+    assert found.uplink is not None
+    assert (found.uplink.lost.tolist(), found.interval) == ([False, True, True, False], 0.02)
+    rows.write_text("lost\n0\n1\n0\n")
+    assert of_trace(str(rows), "uplink", 0.005).interval == 0.005
 
 
 def test_negative_delays_count_as_none_and_are_counted() -> None:

@@ -408,6 +408,26 @@ def test_what_is_no_measurement_is_refused(tmp_path: Path) -> None:
             read_link(path, name=name)
 
 
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("64 bytes from x: icmp_seq=1 ttl=1 time=1 ms\n64 bytes from x: icmp_seq=9000000000 ttl=1 time=1 ms\n",
+         "numbers go from 1 to 9000000000, and 2 packets have one"),
+        ("1\n2\n999999999999\n", "too long for a packet every 0.005 s"),
+        ('{"start": {"version": "iperf 3"}, "intervals": [{"sum": {"packets": 5, "lost_packets": 1}}]}',
+         "has neither intervals nor sums"),
+        ('{"start": {"version": "iperf 3"', "is no whole JSON file"),
+        ('{"system_info": {}, "open_timeouts": "1s", "round_trips": [', "has no round trips"),
+        ("seq,time,rtt\n,,\n", "has no row with a number"),
+    ],
+)  # fmt: skip
+def test_broken_files_are_refused_with_a_reason(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "file"
+    path.write_text(text)
+    with pytest.raises(MeasurementError, match=complaint):
+        read_link(path)
+
+
 def test_a_topic_of_a_bag_is_a_link() -> None:
     """The sample's poses at the edge against its own slots."""
     sample = Path(__file__).parents[4] / "bags/sample"
