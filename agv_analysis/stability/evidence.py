@@ -138,7 +138,7 @@ def _with_margin(evidence: Evidence, facts: RunFacts, judgements: Mapping[str, J
 
 def _with_longest(evidence: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
     """With whether outages of up to the longest one are survived in any order, which only a green word asks for."""
-    if not _asks_for_outages(evidence) or evidence.is_unlimited:
+    if not _asks_for_outages(evidence):
         return evidence
     return replace(evidence, n_bursts=facts.n if judgements["bursts"].stable else -1, is_least=True)
 
@@ -174,7 +174,9 @@ def evidence_of_scenario(
     if not with_margin and math.isinf(found.v_max) and decide(found).word == UNSTABLE:
         return found
     found = replace(found, repeated=repeated_run(facts.run, facts.loop))
-    return _with_margin(found, facts, judgements) if with_margin else _with_longest(found, facts, judgements)
+    if with_margin:
+        return _with_margin(found, facts, judgements)
+    return replace(found, n_bursts=-1, is_least=True) if found.is_unlimited else _with_longest(found, facts, judgements)
 
 
 def _to_judge(scenario: Scenario) -> Scenario:

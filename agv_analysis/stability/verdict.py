@@ -268,6 +268,8 @@ def _limit(evidence: Evidence) -> str:
         seen = "outages of such a link have no longest one"
     if evidence.n_bursts is None:
         return f"{seen}; outages of any length are survived"
+    if evidence.is_least and evidence.n_bursts < 0:
+        return f"{seen}; not proved to be survived in any order"
     return f"{seen}; guaranteed limit: {'at least ' if evidence.is_least else ''}{evidence.n_bursts}"
 
 
