@@ -30,6 +30,10 @@ _SEEDS = 20
 @click.command("stability")
 @with_settings
 @with_corridor
+@click.option(
+    "--confidence", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True), metavar="C",
+    help="Say, too, which corridor a lap keeps with the probability C, and up to which speed it keeps the --corridor.",
+)  # fmt: skip
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
@@ -47,6 +51,7 @@ def command(
     corridor_width: float | None,
     corridor_along: float | None,
     laps: int | None,
+    confidence: float | None,
     json_file: Path | None,
     axes: str | None,
     points: int,
@@ -60,6 +65,7 @@ def command(
       agv-ncs stability config/paper.yaml
       agv-ncs stability config/outages.yaml --set controller.kx=5.0 --set error_detector.track=line --json margins.json
       agv-ncs stability config/outages.yaml --corridor 0.25
+      agv-ncs stability config/outages.yaml --set error_detector.track=eight --corridor 0.25 --confidence 0.95
       agv-ncs stability config/paper.yaml --map kx,ts --csv map.csv --picture map.png
     """
     from rich.console import Console
@@ -67,6 +73,7 @@ def command(
     from rich.table import Table
 
     from agv_analysis.corridor.corridor import corridor
+    from agv_analysis.corridor.kept_with_confidence import kept_with_confidence
     from agv_analysis.report.table import colour_of
     from agv_analysis.scenario import load_scenario
     from agv_analysis.stability.empirical import simulated_twins, too_short, with_an_end
@@ -90,7 +97,12 @@ def command(
         found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
         evidence = evidence_of_scenario(scenario, twins.evidence)
         verdict = decide(evidence)
-        within = corridor(scenario, laps, lambda what: status.update(f"within the corridor: {what} ..."))
+
+        def within_corridor(what: str) -> None:
+            status.update(f"within the corridor: {what} ...")
+
+        within = corridor(scenario, laps, within_corridor)
+        kept = None if confidence is None else kept_with_confidence(scenario, confidence, laps, within_corridor)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
@@ -103,7 +115,7 @@ def command(
         said_of_twins += "; they come together, but the loop does not settle even without losses"
     elif not twins.is_long_enough and settles_without_losses(scenario):
         said_of_twins += f"; {too_short(twins.left_without_losses)}"
-    of_corridor = () if within is None else within.rows()
+    of_corridor = [*(() if within is None else within.rows()), *(() if kept is None else kept.rows())]
     for name, value in (*found.rows(), ("Twins of this scenario, simulated", said_of_twins), *of_corridor):
         table.add_row(name, escape(value))
     console.print(table)
@@ -128,7 +140,8 @@ def command(
         link = evidence.link  # as a run shows it, where the channel is not known
         fit = None if link is None else {"goodness": link.goodness.to_json()}
         word: dict[str, Any] = {**verdict.to_json(), "margin": verdict.margin, **evidence.to_json(), "channel_fit": fit}
-        word |= {} if within is None else {"corridor": within.to_json()}
+        if within is not None:
+            word["corridor"] = {**within.to_json(), "kept": None if kept is None else kept.to_json()}
         write_json(json_file, {**word, **found.to_json(), **_gains_to_json(best, why_no_gain)})
 
 

@@ -1,0 +1,137 @@
+"""The inverse: the narrowest corridor that a lap keeps with a given confidence, and the largest speed at which it does.
+
+By the largest share of the corridor that each of many simulated laps uses: the quantile of these shares is by how much
+the corridor may be narrower, or must be wider. Its interval is that of order statistics, without a model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.corridor.lap_loop import LapLoop
+from agv_analysis.corridor.leaving import LAPS, leaving
+from agv_analysis.corridor.widths import widths_of
+from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
+from agv_cloud.parameters import CSV, PATH
+from agv_ros.errors import UserError
+
+MOST = 0.99
+"""Largest confidence that is asked for: of a rarer event `corridor` tells the probability."""
+
+_BEYOND = 20
+"""Laps, at least, that are expected beyond the quantile."""
+
+_RANGE, _STEPS = 16.0, 7
+"""The speed is searched for between its value divided and multiplied by this, in so many bisections."""
+
+_TRACKS_WITHOUT = ("paper", CSV, PATH)
+"""Tracks that have speeds of their own, or a path that comes later."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a lap keeps with a confidence, under the scenario's link."""
+
+    confidence: float
+    width: Estimate
+    """Half-width of the narrowest corridor [m], of the same shape as the scenario's."""
+    speed: float | None
+    """Largest speed [m/s] at which a lap keeps the scenario's corridor; None: `speed_reason` says why."""
+    speed_reason: str
+    laps: int
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Name and value of each figure, in plain text."""
+        of_laps = f"{self.confidence:g} of all laps"
+        width = f"{self.width.value:.3g} m ({self.width.low:.3g} .. {self.width.high:.3g})"
+        speed = (
+            self.speed_reason if self.speed is None else f"{self.speed:.3g} m/s, with which {of_laps} keep the corridor"
+        )
+        return [("Narrowest corridor", f"{width}, which {of_laps} keep"), ("Largest speed", speed)]
+
+    def to_json(self) -> dict[str, Any]:
+        """The figures by name; SI units."""
+        ends = (self.width.low, self.width.high)
+        return {
+            "confidence": self.confidence,
+            "narrowest_half_width": _finite(self.width.value),
+            "narrowest_half_width_interval": [_finite(end) for end in ends],
+            "largest_speed": self.speed,
+            "largest_speed_reason": self.speed_reason or None,
+            "laps": self.laps,
+        }
+
+
+def kept_with_confidence(
+    scenario: Scenario, confidence: float, laps: int | None = None, progress: Callable[[str], None] = lambda what: None
+) -> Kept:
+    """Of a scenario with a corridor. Raises UserError for one without, or for a confidence that laps cannot show."""
+    widths = widths_of(scenario.error_detector)
+    if widths is None:
+        raise UserError("a confidence is asked of a corridor: set error_detector.corridor, or --corridor")
+    if not 0.0 < confidence <= MOST:
+        raise UserError(f"--confidence must be above 0 and at most {MOST:g}, got {confidence:g}")
+    laps = laps or max(LAPS, math.ceil(_BEYOND / (1.0 - confidence)))
+    progress("the narrowest corridor")
+    found = quantile(_shares(scenario, laps), confidence)
+    width = Estimate(*(value * widths.half_width for value in (found.value, found.low, found.high)))
+    speed, reason = _largest_speed(scenario, confidence, laps, progress)
+    return Kept(confidence, width, speed, reason, laps)
+
+
+def quantile(values: Floats, share: float) -> Estimate:
+    """Quantile of a distribution by values drawn from it, shape (N,); its 95 % interval is that of order statistics."""
+    ordered, count = np.sort(values), len(values)
+    log_share, log_rest = math.log(share), math.log1p(-share)
+    ways = np.array(
+        [math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in range(count + 1)]
+    )
+    k = np.arange(count + 1)
+    at_most = np.cumsum(np.exp(ways + k * log_share + (count - k) * log_rest))
+    low, high = int(np.searchsorted(at_most, 0.025)), int(np.searchsorted(at_most, 0.975))
+    value = ordered[min(count - 1, math.ceil(share * count) - 1)]
+    above = ordered[high] if high < count else math.inf
+    return Estimate.about(float(value), float(ordered[low - 1]) if low > 0 else 0.0, float(above))
+
+
+def _shares(scenario: Scenario, laps: int) -> Floats:
+    """Largest share of its corridor that each lap of a scenario uses, shape (laps,)."""
+    widths = widths_of(scenario.error_detector)
+    assert widths is not None
+    return leaving(LapLoop(scenario, widths), None, laps).largest
+
+
+def _largest_speed(
+    scenario: Scenario, confidence: float, laps: int, progress: Callable[[str], None]
+) -> tuple[float | None, str]:
+    """The largest speed at which laps keep the corridor, or why there is none."""
+    detector = scenario.error_detector
+    if detector.track in _TRACKS_WITHOUT:
+        return None, f"the track {detector.track} has speeds of its own, error_detector.speed does not change them"
+
+    def keeps(speed: float) -> bool:
+        progress(f"laps at {speed:.3g} m/s")
+        faster = replace(scenario, error_detector=replace(detector, speed=speed))
+        return quantile(_shares(faster, laps), confidence).value <= 1.0
+
+    slow, fast = detector.speed / _RANGE, min(detector.speed * _RANGE, 100.0)
+    if keeps(fast):
+        return None, f"it is kept at {fast:.3g} m/s, too, the fastest that was tried"
+    if not keeps(slow):
+        return None, f"it is not even kept at {slow:.3g} m/s"
+    for _ in range(_STEPS):
+        middle = math.sqrt(slow * fast)
+        slow, fast = (middle, fast) if keeps(middle) else (slow, middle)
+    return slow, ""
+
+
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if math.isfinite(value) else None
