@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
+    from agv_analysis.corridor.corridor_of_run import CorridorOfRun
     from agv_analysis.scenario import Scenario
     from agv_analysis.stability.analysis import Observations
 
@@ -48,8 +49,10 @@ def corridor_settings(width: float | None, along: float | None) -> tuple[str, ..
     return tuple(f"error_detector.{name}={value!r}" for name, value in named if value is not None)
 
 
-def print_corridor(analysis: Observations, scenario: Scenario, is_known: bool, laps: int | None) -> dict[str, Any]:
-    """Print what a run and its scenario say of the corridor, if there is one; returns it for --json.
+def print_corridor(
+    analysis: Observations, scenario: Scenario, is_known: bool, laps: int | None
+) -> CorridorOfRun | None:
+    """Print what a run and its scenario say of the corridor, if there is one; returns it.
 
     `is_known`: the channel is the scenario's, else it is the one that fits the run.
     """
@@ -64,7 +67,7 @@ def print_corridor(analysis: Observations, scenario: Scenario, is_known: bool, l
             analysis, scenario, is_known, laps, lambda what: status.update(f"within the corridor: {what} ...")
         )
     if found is None:
-        return {}
+        return None
     console, table = Console(highlight=False), Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column()
@@ -73,7 +76,12 @@ def print_corridor(analysis: Observations, scenario: Scenario, is_known: bool, l
     console.print(table)
     for note in found.notes:
         console.print(f"[bold yellow]Corridor:[/] {escape(note)}.")
-    return {"corridor": found.to_json()}
+    return found
+
+
+def corridor_json(within: CorridorOfRun | None) -> dict[str, Any]:
+    """What `print_corridor` has found, for --json."""
+    return {} if within is None else {"corridor": within.to_json()}
 
 
 @contextmanager
@@ -109,16 +117,18 @@ def with_report(command: F) -> F:
     )
 
 
-def report_on(analysis: Observations, report: Path | None, figures: Path | None) -> None:
-    """Write what `with_report` asks for."""
+def report_on(
+    analysis: Observations, report: Path | None, figures: Path | None, within: CorridorOfRun | None = None
+) -> None:
+    """Write what `with_report` asks for, with what the run says of its corridor."""
     if report is not None:
         from agv_analysis.report.page import write_report
 
-        write_report(analysis, report)
+        write_report(analysis, report, within)
         click.echo(f"report:  {report}")
     if figures is not None:
         from agv_analysis.report.matplotlib_figures import draw_figures
-        from agv_analysis.report.panels import panels
+        from agv_analysis.report.page import all_panels
 
-        draw_figures(panels(analysis), figures)
+        draw_figures(all_panels(analysis, within), figures)
         click.echo(f"figures: {figures}")

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from agv_analysis.commands import (
+    corridor_json,
     corridor_settings,
     print_corridor,
     report_on,
@@ -67,8 +68,8 @@ def command(
     draw(run, where)
     print_table(analysis)
     scenario = run.scenario.with_settings(corridor_settings(corridor_width, corridor_along), "--corridor")
-    within = print_corridor(analysis, scenario, False, laps) if run.gains_known else {}
+    within = print_corridor(analysis, scenario, False, laps) if run.gains_known else None
     click.echo(f"bag:     {bag}\npicture: {where}")
-    report_on(analysis, report, figures)
+    report_on(analysis, report, figures, within)
     if json_file is not None:
-        write_json(json_file, {**analysis.to_json(), **within})
+        write_json(json_file, {**analysis.to_json(), **corridor_json(within)})

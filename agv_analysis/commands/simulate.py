@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import (
+    corridor_json,
     corridor_settings,
     print_corridor,
     report_on,
@@ -65,9 +66,9 @@ def command(
     if csv_file is not None:
         write_csv(csv_file, run)
         click.echo(f"csv:     {csv_file}")
-    report_on(analysis, report, figures)
+    report_on(analysis, report, figures, within)
     if json_file is not None:
-        write_json(json_file, {**analysis.to_json(), **within})
+        write_json(json_file, {**analysis.to_json(), **corridor_json(within)})
 
 
 COLUMNS = (

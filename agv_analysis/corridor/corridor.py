@@ -16,6 +16,7 @@ from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, single_ou
 from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stationary_deviation
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
@@ -59,8 +60,8 @@ class Corridor:
     """Deviation in the long run, by its second moments; None: not computed, `stationary_reason` says why."""
     stationary_reason: str
     leaving: Leaving
-    lap_slots: int
-    """Slots of a lap."""
+    lap: Floats
+    """X_r(k) and its speeds over a lap: x, y, theta, v_r, w_r, shape (N, 5)."""
     reason: str = ""
     notes: tuple[str, ...] = ()
 
@@ -191,7 +192,7 @@ def corridor(
     found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"))
     return Corridor(
         widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, *_stationary(loop), found,
-        loop.steps, reason, tuple(_notes(loop, single)),
+        loop.lap, reason, tuple(_notes(loop, single)),
     )  # fmt: skip
 
 

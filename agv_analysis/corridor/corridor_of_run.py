@@ -93,7 +93,7 @@ def _with_doubts(found: Corridor, fit: ChannelFit) -> Corridor:
     def relative(of_p: Floats, of_r: Floats) -> Floats:
         return np.asarray(of_p * of_r / (of_p + of_r) / begins * ((1.0 - of_r) / (1.0 - r)) ** length)
 
-    lap = found.lap_slots
+    lap = len(found.lap)
     length = max(0.0, np.log(rate / lap / begins) / np.log1p(-r))
     low, high = interval_of(fit.transitions, relative)
     leaving, longer, shorter = found.leaving, 1.0 / min(low, 1.0), 1.0 / max(high, 1.0)

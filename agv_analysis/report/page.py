@@ -10,11 +10,14 @@ import importlib
 import json
 import platform
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from agv_analysis.corridor.corridor_of_run import CorridorOfRun
+from agv_analysis.report.corridor_panels import corridor_panel, edges
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
 from agv_analysis.report.verdict_sentence import sentence
@@ -31,9 +34,12 @@ _HEIGHTS = {"time": 820}
 _HEIGHT = 460
 
 
-def write_report(analysis: Observations, path: str | Path) -> None:
-    """Write the report of a run. Raises UserError if it cannot be written or if plotly or jinja2 is not installed."""
-    write_page(render(analysis), Path(path))
+def write_report(analysis: Observations, path: str | Path, within: CorridorOfRun | None = None) -> None:
+    """Write the report of a run, and what it says of a corridor.
+
+    Raises UserError if it cannot be written or if plotly or jinja2 is not installed.
+    """
+    write_page(render(analysis, within), Path(path))
 
 
 def write_page(html: str, path: Path) -> None:
@@ -44,13 +50,15 @@ def write_page(html: str, path: Path) -> None:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
-def render(analysis: Observations) -> str:
+def render(analysis: Observations, within: CorridorOfRun | None = None) -> str:
     """The report of a run as HTML. Raises UserError if plotly or jinja2 is not installed."""
-    drawn, figures = list(panels(analysis)), dict(_rows(analysis))
+    drawn, figures = all_panels(analysis, within), dict(_rows(analysis))
+    if within is not None:
+        figures |= dict(within.rows())
     return fill(
         "report.html.j2",
         figures={key: figure(group) for key, _, group in _groups(drawn)},
-        data=report_json(analysis, drawn),
+        data=report_json(analysis, drawn) | ({} if within is None else {"corridor": within.to_json()}),
         title=f"agv_ncs: {analysis.run.source}",
         verdict=sentence(analysis),
         word=analysis.verdict.word if isinstance(analysis, Analysis) and not analysis.run.unexplained else "unknown",
@@ -63,6 +71,18 @@ def render(analysis: Observations) -> str:
         parameters=analysis.run.scenario.to_yaml(),
         reproduce=_reproduce(analysis),
     )
+
+
+def all_panels(analysis: Observations, within: CorridorOfRun | None = None) -> list[Panel]:
+    """The panels of a run, with its corridor drawn, if there is one, on the track and over a lap."""
+    drawn = list(panels(analysis))
+    if within is None:
+        return drawn
+    with_edges = (
+        replace(panel, lines=(*edges(within.expected), *panel.lines)) if panel.key == "track" else panel
+        for panel in drawn
+    )
+    return [*with_edges, corridor_panel(within.expected)]
 
 
 def fill(template: str, figures: dict[str, Any], data: dict[str, Any], **content: Any) -> str:

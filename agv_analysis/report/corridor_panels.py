@@ -1,0 +1,47 @@
+"""The corridor of a run: how far outages lead by the place where they begin, and its edges along the track."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agv_analysis.corridor.corridor import Corridor
+from agv_analysis.report.panels import DRIVEN, LIMIT, OTHER, Line, Panel
+from agv_analysis.run import Floats
+
+
+def corridor_panel(found: Corridor) -> Panel:
+    """Largest distance from the reference over a lap: after one outage that begins there, and in the tube for any."""
+    seconds: Floats = np.arange(len(found.lap), dtype=np.float64) * found.ts
+    lines = []
+    if found.single is not None and found.single.n is not None and found.single.n >= 0:
+        name = f"after one outage of {found.single.n} slots that begins here"
+        lines.append(Line(name, seconds, found.single.shares * found.widths.half_width, DRIVEN))
+    if found.tube is not None:
+        name = f"at most, under any outages of up to {found.tube.n} slots"
+        lines.append(Line(name, seconds, _of_lap(found.tube.distance, len(seconds)), OTHER))
+    ends = seconds[[0, -1]]
+    lines.append(Line("corridor", ends, np.full(2, found.widths.half_width), LIMIT))
+    return Panel("corridor", "Within the corridor", "time of the lap [s]", "deviation [m]", tuple(lines))
+
+
+def edges(found: Corridor) -> tuple[Line, ...]:
+    """The corridor's edges along a lap, and those of the tube, as lines on the track."""
+    lines = [_edge("corridor", found.lap, np.full(len(found.lap), found.widths.half_width), LIMIT)]
+    if found.tube is not None:
+        name = f"tube for any outages up to {found.tube.n} slots"
+        lines.append(_edge(name, found.lap, _of_lap(found.tube.distance, len(found.lap)), OTHER))
+    return tuple(lines)
+
+
+def _of_lap(values: Floats, steps: int) -> Floats:
+    return np.asarray(np.broadcast_to(values, steps))
+
+
+def _edge(name: str, lap: Floats, distance: Floats, role: str) -> Line:
+    """Both edges of a band about the track as one line, with a gap between them."""
+    across = np.column_stack((-np.sin(lap[:, 2]), np.cos(lap[:, 2]))) * distance[:, None]
+    gap = np.full((1, 2), math.nan)
+    points = np.concatenate((lap[:, :2] + across, gap, lap[:, :2] - across))
+    return Line(name, points[:, 0], points[:, 1], role)
