@@ -324,6 +324,15 @@ def test_what_is_no_bag(tmp_path: Path) -> None:
         read_bag(tmp_path / "bad.db3")
 
 
+def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"nothing of the kind")
+    with pytest.raises(BagError) as refusal:  # which holds on to all that was there when it was raised
+        read_bag(tmp_path / "bad.mcap")
+    still_open = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    assert str(tmp_path / "bad.mcap") not in still_open
+    assert "is no MCAP file" in str(refusal.value)
+
+
 def test_a_topic_recorded_with_two_types_is_refused(tmp_path: Path) -> None:
     file = io.BytesIO()
     writer = Writer(file)

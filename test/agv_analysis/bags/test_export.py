@@ -100,3 +100,18 @@ def test_names_that_are_no_file_names_are_encoded(tmp_path: Path) -> None:
     paths = export_csv(read_bag(tmp_path / "a.mcap"), tmp_path / "out")
     assert sorted(path.name for path in paths) == sorted(["......up.csv", "a%00b.csv", "a%20b.csv", "a_b.csv"])
     assert {path.parent for path in paths} == {tmp_path / "out"}
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        [("position.x", "f8"), ("position.y", "f8", 2), ("position.z", "f8")],
+        [("position.x", "S3"), ("position.y", "S3"), ("position.z", "S3")],
+        [("len(poses)", "u4"), ("poses.child_frame_id", "S2"), ("poses.position.x", "f8", 2)],
+    ],
+)
+def test_columns_that_only_have_the_names_of_a_pose_are_none(odd: list[Any]) -> None:
+    turn = [(f"{odd[-1][0].rpartition('position')[0]}orientation.{axis}", *odd[-1][1:]) for axis in "xyzw"]
+    rest = [(odd[-1][0][:-1] + axis, *odd[-1][1:]) for axis in "yz"] if len(odd[-1]) > 2 else []
+    rows = np.zeros(3, [("log_time_ns", "i8"), *odd, *rest, *turn])
+    assert list(trajectories_of(rows)) == []
