@@ -239,6 +239,9 @@ def _by_name(path: Path) -> Contents:
             contents.findings.add(f"{file.name} beside .mcap files, taken for another form of them, not read")
     _drop_packed_twins(contents)
     _report_holes(contents)
+    first = min((number for file in contents.files if (number := _number(file)) is not None), default=0)
+    if first > 0 and len(contents.files) > 1:
+        contents.findings.add(f"split bag that begins with number {first}, the files before it not here")
     return contents
 
 

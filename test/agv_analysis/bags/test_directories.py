@@ -32,6 +32,8 @@ def test_every_message_that_other_readers_find_is_found(any_bag: Path, by_others
         ("renamed split", "x_1.db3 named by metadata.yaml but missing, y_1.db3 read in place of it: 1"),
         ("compressed by hand", "x_1.db3.zstd named by metadata.yaml, x_1.db3.zst read in its place: 1"),
         ("path of a file of a split", "x_1.db3.zstd is one of 2 files of a split bag, all of them read: 1"),
+        ("compressed splits without metadata.yaml", "split bag that begins with number 9, the files before it not "
+         "here: 1"),
         ("compressed splits without metadata.yaml", "directory without metadata.yaml, all of its files read in the "
          "order of their numbers: 1"),
     ],
