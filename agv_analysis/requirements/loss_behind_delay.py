@@ -9,8 +9,10 @@ loop is mean-square stable if and only if it is stable in the mean and
 
     p s  rho( mean over the unit circle of conj(T) (x) T ) < 1
 
-where T is the transfer function from the noise to v. It costs the same for any delay, while the second moments grow
-with the square of it (`delayed_mean_square`, against which a test holds this). Source: Willems and Blankenship,
+where T is the transfer function from the noise to v. Stability in the mean is read off the winding of the
+characteristic polynomial along the unit circle (the argument principle), whose phase also says where the circle has to
+be looked at closely. All of it costs about the same for any delay, while second moments grow with the square of it
+(`delayed_mean_square`, against which a test holds this). Source: Willems and Blankenship,
 Frequency domain stability criteria for stochastic systems, IEEE Trans. Autom. Control 16, 1971; Elia, Remote
 stabilization over fading channels, Systems & Control Letters 54, 2005.
 """
@@ -23,16 +25,22 @@ from numpy.typing import NDArray
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
 
-_POINTS = 1024
-"""Frequencies on the unit circle that are asked in any case."""
+_FIRST, _LAST = 1e-6, np.pi
+"""The half circle that is looked at [rad]: at 0 the plant integrates, and the other half is its mirror image."""
 
-_NEAR, _AROUND = 0.05, 200
-"""A pole of the mean that is closer than this to the unit circle makes a peak, which gets so many frequencies more."""
+_POINTS, _PER_SLOT = 512, 8
+"""Angles that are asked at first, so many for each slot of the delay at least."""
+
+_TURN = 0.1
+"""The phase turns by less than this from one angle to the next [rad], else there are more angles between them."""
+
+_ROUNDS, _MOST = 40, 50_000
+"""How often angles are halved, and how many there may be: beyond, a root is on the circle, which is not stable."""
 
 _GRID = (1e-4, 1e-3, 0.01, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 0.99, 0.999, 0.9999)
 """Loss probabilities between which a border is looked for, from below."""
 
-_BISECTIONS = 11
+_BISECTIONS = 12
 
 Complex = NDArray[np.complex128]
 
@@ -64,39 +72,56 @@ def critical_loss_behind(loop: LinearLoop, delay: int) -> float:
 
 def _is_stable(loop: LinearLoop, delay: int, p: float) -> bool:
     """Does E[|z|^2] die out behind this delay, with this loss probability?"""
-    poles = np.linalg.eigvals(_mean(loop, delay, p)).astype(np.complex128)
-    if np.abs(poles).max() >= 1.0:
+    angles, turned = _circle(loop, delay, p)
+    # All m + q (d + 1) roots are inside if the polynomial winds as often about 0; z^(q (d + 1)) is left out of it.
+    if round(turned / np.pi) != loop.size:
         return False
-    return p == 0.0 or _gain(loop, delay, p, _angles(poles)) < 1.0
+    return p == 0.0 or _gain(loop, delay, p, angles) < 1.0
 
 
-def _mean(loop: LinearLoop, delay: int, p: float) -> Floats:
-    """The loop of the means: of (z(k), C z(k-1) .. C z(k-d), y(k-1)), shape (m + q (d + 1), m + q (d + 1))."""
-    m, q = loop.size, loop.outputs
-    size = m + q * (delay + 1)
-    rows = np.eye(size)
-    C, late, held = rows[:q], rows[:q] if delay == 0 else rows[size - 2 * q : size - q], rows[size - q :]
-    y = p * held + (1.0 - p) * late
-    window = np.concatenate((C, rows[m : size - 2 * q])) if delay else np.zeros((0, size))
-    return np.concatenate((loop.F[0] @ rows[:m] + loop.G[0] @ y, window, y))
+def _circle(loop: LinearLoop, delay: int, p: float) -> tuple[Floats, float]:
+    """Angles in (0, pi], denser where a root is near, and by how much the polynomial's phase turns over them [rad].
+
+    The turn is NaN where a root is on the circle.
+    """
+    angles = np.union1d(
+        np.linspace(_FIRST, _LAST, max(_POINTS, _PER_SLOT * delay)), np.geomspace(_FIRST, 0.1, 64)
+    )  # fmt: skip
+    values = _characteristic(loop, delay, p, angles)
+    for _ in range(_ROUNDS):
+        turns = np.angle(values[1:] * values[:-1].conj())
+        wide = np.flatnonzero(np.abs(turns) > _TURN)
+        if not len(wide):
+            return angles, float(turns.sum())
+        if len(angles) > _MOST:
+            break
+        between = 0.5 * (angles[wide] + angles[wide + 1])
+        values = np.insert(values, wide + 1, _characteristic(loop, delay, p, between))
+        angles = np.insert(angles, wide + 1, between)
+    return angles, np.nan
 
 
-def _angles(poles: Complex) -> Floats:
-    """Angles in (0, pi), denser where a pole is near the unit circle, with both ends; shape (n,), increasing."""
-    found = [np.linspace(0.0, np.pi, _POINTS)]
-    for pole in poles[(np.abs(poles) > 1.0 - _NEAR) & (poles.imag >= 0.0)]:
-        wide = np.sinh(np.linspace(-12.0, 12.0, _AROUND))
-        found.append(np.angle(pole) + (1.0 - np.abs(pole)) * wide)
-    return np.unique(np.clip(np.concatenate(found), 1e-9, np.pi))  # at 0 the plant integrates
+def _characteristic(loop: LinearLoop, delay: int, p: float, angles: Floats) -> Complex:
+    """det(zI - F) det(inner) on the unit circle, shape (n,): the means' characteristic polynomial but for a power."""
+    zeta = np.exp(1j * angles)
+    open_loop = np.linalg.det(zeta[:, None, None] * np.eye(loop.size) - loop.F[0])
+    return np.asarray(open_loop * np.linalg.det(_inner(loop, delay, p, zeta)[0]), dtype=np.complex128)
+
+
+def _inner(loop: LinearLoop, delay: int, p: float, zeta: Complex) -> tuple[Complex, Complex]:
+    """I (1 - p / z) - s z^-d H and z^-d H, H being the transfer function from y to C z; shapes (n, q, q)."""
+    q, z = loop.outputs, zeta[:, None, None]
+    plant = np.linalg.solve(z * np.eye(loop.size) - loop.F[0], loop.G[0].astype(np.complex128)[None])[:, :q]
+    late = z**-delay * plant
+    return np.eye(q) * (1.0 - p / z) - (1.0 - p) * late, late
 
 
 def _gain(loop: LinearLoop, delay: int, p: float, angles: Floats) -> float:
     """p s times the spectral radius of the mean of conj(T) (x) T; T at -angle is its conjugate."""
-    q, zeta = loop.outputs, np.exp(1j * angles)[:, None, None]
-    plant = np.linalg.solve(zeta * np.eye(loop.size) - loop.F[0], loop.G[0].astype(np.complex128)[None])[:, :q]
-    late = zeta**-delay * plant
-    inner = np.eye(q) * (1.0 - p / zeta) - (1.0 - p) * late
-    T = np.linalg.solve(inner.transpose(0, 2, 1), (late - np.eye(q) / zeta).transpose(0, 2, 1)).transpose(0, 2, 1)
+    q, zeta = loop.outputs, np.exp(1j * angles)
+    inner, late = _inner(loop, delay, p, zeta)
+    v = late - np.eye(q) / zeta[:, None, None]
+    T = np.linalg.solve(inner.transpose(0, 2, 1), v.transpose(0, 2, 1)).transpose(0, 2, 1)
     weights = np.zeros(len(angles))
     steps = np.diff(angles)
     weights[:-1] += 0.5 * steps

@@ -117,7 +117,9 @@ def _holds(loop: LinearLoop, n: int, latency: float) -> tuple[bool, str]:
         late = f", or a delay of {slots} slots" if slots else ""
         return True, f"any sequence of outages of up to {n} slots dies out{late}"
     if found.verdict == joint_spectral_radius.UNSTABLE:
-        return False, f"outages of {found.worst} slots, again and again, make the error grow"
+        length = "1 slot" if found.worst == 1 else f"{found.worst} slots"
+        what = f"outages of {length}, again and again, make the error grow"
+        return False, what if found.worst else "the error does not contract even without outages"
     return False, f"that any outages of up to {n} slots die out is not proved"
 
 
@@ -180,8 +182,8 @@ def _largest_interval(scenario: Scenario, v: float, offered: OfferedService) -> 
 
 
 def _gains(scenario: Scenario, n: int) -> tuple[float | None, float | None]:
-    """(largest, best) K_x [1/s], straight track, for outages of up to n slots; None for other laws, drives that lag."""
-    if not is_kanayamas_law(scenario):
+    """(largest, best) K_x [1/s] on a straight track for outages of up to n slots; None where no closed form holds."""
+    if not is_kanayamas_law(scenario) or scenario.error_detector.policy == "predict":
         return None, None
     unit = replace(scenario, controller=replace(scenario.controller, kx=1.0))
     try:

@@ -29,12 +29,12 @@ def rows_of_loop(found: LoopRequirements) -> Iterator[Row]:
         within = f"Survival time, within {corridor.half_width:g} m"
         yield within, _slots(corridor.any_sequence, ts)
         yield f"{within}, one outage alone", _slots(corridor.single, ts)
-    latency = None if found.latency is None else _ms(found.latency)
+    latency = _ms(found.latency) if found.latency else None
     yield "Maximum latency, without losses", _said(latency, reasons, "latency_max_s")
     for delay, loss in found.delays:
         if delay > 0.0:
             yield f"Independent losses behind {_ms(delay)}", f"below {loss:.4g}"
-    rate = None if found.loss_rate is None else f"below {found.loss_rate:.4g}"
+    rate = f"below {found.loss_rate:.4g}" if found.loss_rate else None
     yield "Independent losses, without delay", _said(rate, reasons, "loss_rate_max")
     if found.mean_burst is not None:
         yield "Mean burst at the uplink's loss rate", _burst(found.mean_burst, found.transfer_interval)

@@ -96,10 +96,10 @@ def test_a_latency_that_is_offered_too() -> None:
     assert "always 13 slots late" in refused.why
 
 
-@pytest.mark.parametrize("delay", [0, 2, 7, 11])
-def test_losses_behind_a_delay_are_those_of_the_second_moments(delay: int) -> None:
-    """The norm of a transfer function against the moments driven step by step."""
-    loop = loop_on_lap(of(25.0)).frozen(0)
+@pytest.mark.parametrize(("kx", "delay"), [(25.0, 0), (25.0, 7), (25.0, 12), (5.0, 30)])
+def test_losses_behind_a_delay_are_those_of_the_second_moments(kx: float, delay: int) -> None:
+    """The norm of a transfer function, and the argument principle, against the moments driven step by step."""
+    loop = loop_on_lap(of(kx)).frozen(0)
     p = critical_loss_behind(loop, delay)
     for factor, sign in ((0.98, -1.0), (1.02, 1.0)):
         growth = delayed_mean_square.lap_growth(loop, behind_constant_delay(bernoulli(min(1.0, p * factor)), delay))
