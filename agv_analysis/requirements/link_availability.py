@@ -47,24 +47,29 @@ class LinkAvailability:
         return max(0, packets_for(availability) - self.packets)
 
     def to_json(self) -> dict[str, Any]:
-        """`availability`, `unavailability`, `mtbf_s`, `loss_rate`, each with `value`, `low`, `high`."""
+        """`availability`, `unavailability`, `mtbf_s`, `loss_rate`, and the interval of each, null for no end."""
+        named = {
+            "availability": self.availability,
+            "unavailability": self.unavailability,
+            "mtbf_s": self.mtbf,
+            "loss_rate": self.loss_rate,
+        }
+        figures: dict[str, Any] = {}
+        for name, estimate in named.items():
+            figures[name] = _finite(estimate.value)
+            figures[f"{name}_interval"] = [_finite(estimate.low), _finite(estimate.high)]
         return {
-            **{
-                name: {key: value if math.isfinite(value) else None for key, value in _named(estimate).items()}
-                for name, estimate in (
-                    ("availability", self.availability), ("unavailability", self.unavailability),
-                    ("mtbf_s", self.mtbf), ("loss_rate", self.loss_rate),
-                )
-            },
+            **figures,
             "latency_s": self.latency,
             "failures": self.failures,
             "packets": self.packets,
             "assumption": self.assumption,
-        }  # fmt: skip
+        }
 
 
-def _named(estimate: Estimate) -> dict[str, float]:
-    return {"value": estimate.value, "low": estimate.low, "high": estimate.high}
+def _finite(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if math.isfinite(value) else None
 
 
 def _exactly(value: float) -> Estimate:

@@ -428,6 +428,11 @@ def test_broken_files_are_refused_with_a_reason(tmp_path: Path, text: str, compl
         read_link(path)
 
 
+def test_the_page_of_links_has_a_row_for_every_format() -> None:
+    page = (Path(__file__).parents[4] / "docs/links.md").read_text()
+    assert [name for name in FORMATS if f"`{name}`" not in page] == []
+
+
 def test_a_topic_of_a_bag_is_a_link() -> None:
     """The sample's poses at the edge against its own slots."""
     sample = Path(__file__).parents[4] / "bags/sample"
