@@ -30,6 +30,8 @@ _DIVERGED = 1e3
 
 LOOKS_AHEAD = "the law looks ahead, so that the loop's errors are not the AGV's deviation"
 
+_NOT_ASKED = "not asked for"
+
 _LONGEST_ANY = 500
 """Longest outages that are tried in sequences."""
 
@@ -81,7 +83,8 @@ class Corridor:
         else:
             yield "Longest single outage", self._single(self.single)
             yield "Any outages up to n", self._any()
-            yield "The same, proved", self._proved()
+            if self.tube_reason != _NOT_ASKED:
+                yield "The same, proved", self._proved()
         yield "RMS deviation", self._rms()
         yield "Probability to leave", self._probability()
         yield "Mean time to leave", _time(self.leaving.mean_time)
@@ -175,7 +178,7 @@ def corridor(
     if widths is None:
         return None
     loop, single, sequence, n_any, why, reason = LapLoop(scenario, widths), None, None, None, "", ""
-    n_proved, tube, covering, why_no_tube = None, None, None, "" if proved else "not asked for"
+    n_proved, tube, covering, why_no_tube = None, None, None, "" if proved else _NOT_ASKED
     if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
         reason = "messages take time or depend on the place, so that there are not outages alone"
     elif not loop.loss_free_share < _DIVERGED:

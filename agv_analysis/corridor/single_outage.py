@@ -19,6 +19,9 @@ LONGEST = 2000
 _PLACES, _SHORTER = 128, 32
 """Places of the lap at which a first bound is searched for; shorter outages that are tried there."""
 
+FEW_PLACES = 40
+"""Places of the lap for a rough answer."""
+
 _FINE = 8
 """Every so many steps of the lap it is tried whether a shorter one leaves, before every step is."""
 
@@ -67,14 +70,23 @@ def single_outage(loop: LapLoop) -> SingleOutage:
     return _found(loop, shortest - 1, outside.worst, outside if inside is None else inside)
 
 
+def roughly(loop: LapLoop) -> int | None:
+    """As `single_outage().n`, from FEW_PLACES of the lap alone, and none of shorter outages: in a tenth of a second."""
+    shortest = _shortest_leaving(loop, max(1, loop.steps // FEW_PLACES), shorter=0)
+    return None if shortest is None else shortest - 1
+
+
 def _found(loop: LapLoop, n: int | None, step: int, inside: Excursions) -> SingleOutage:
     x, y = loop.lap[step, :2].tolist()
     shares = np.interp(np.arange(loop.steps), inside.steps, inside.share)
     return SingleOutage(n, step, x, y, float(np.hypot(inside.along, inside.across).max()), shares)
 
 
-def _shortest_leaving(loop: LapLoop, every: int) -> int | None:
-    """Shortest outage that leads outside from one of some places; None if there is none up to LONGEST."""
+def _shortest_leaving(loop: LapLoop, every: int, shorter: int = _SHORTER) -> int | None:
+    """Shortest outage that leads outside from one of some places; None if there is none up to LONGEST.
+
+    By bisection, and by so many of those that are `shorter` than what it finds.
+    """
 
     def leaves(n: int) -> bool:
         return bool(loop.excursions(outage(n), every, limit=1.0)[0].share.max() > 1.0)
@@ -87,5 +99,5 @@ def _shortest_leaving(loop: LapLoop, every: int) -> int | None:
     while outside - inside > 1:
         middle = (inside + outside) // 2
         inside, outside = (inside, middle) if leaves(middle) else (middle, outside)
-    shorter = np.unique(np.linspace(0, max(0, outside - 1), _SHORTER).astype(int)).tolist()
-    return next((n for n in shorter if leaves(n)), outside)
+    tried = np.unique(np.linspace(0, max(0, outside - 1), shorter).astype(int)).tolist()
+    return next((n for n in tried if leaves(n)), outside)

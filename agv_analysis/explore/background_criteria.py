@@ -21,6 +21,10 @@ _NICE = 19
 """Background computations yield to the page and to the browser."""
 
 
+_LAPS = 50
+"""Laps that are simulated for a corridor."""
+
+
 def compared_criteria_rows(scenario: Scenario, pinned: Scenario | None) -> list[tuple[str, str, str]]:
     """Name, value and that of a pinned scenario, which meets the same outages; empty without one."""
     others = {} if pinned is None else dict(criteria_rows(with_channel_of(pinned, scenario)))
@@ -33,6 +37,7 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
 
     What cannot be simulated has no rows: the page says why at once.
     """
+    from agv_analysis.corridor.corridor import corridor
     from agv_analysis.report.table import margin_rows
     from agv_analysis.report.verdict_sentence import sentence
     from agv_analysis.simulation.single import simulate
@@ -43,7 +48,8 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
         found = [("Verdict", sentence(analysis))]
         if analysis.floquet is not None:
             found.append(("This loss sequence (Floquet)", _growth(analysis.floquet)))
-        return found + list(margin_rows(scenario))
+        within = corridor(scenario, _LAPS, proved=False)
+        return [*found, *(() if within is None else within.rows()), *margin_rows(scenario)]
     except UserError:
         return []
 

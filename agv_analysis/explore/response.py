@@ -9,6 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agv_analysis.corridor.lap_loop import LapLoop
+from agv_analysis.corridor.single_outage import FEW_PLACES, LONGEST, roughly
+from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.metrics.convergence import convergence
 from agv_analysis.metrics.deviation import deviation
 from agv_analysis.report.panels import LIMIT, OTHER, REFERENCE, Panel, age, distance, speed, track
@@ -44,19 +47,19 @@ def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
     first = beside(track(run), None if other is None else track(other))
     over_time = [beside(panel(run), None if other is None else panel(other)) for panel in (distance, speed, age)]
     values = list(summary_rows(run))
-    others = values_of_other or [""] * len(values)
+    others = values_of_other or {}
     return Response(
         track=figure([first], _MOST_POINTS, markers=_MOST_MARKERS),
         time=figure(over_time, _MOST_POINTS),
-        rows=[(name, value, second) for (name, value), second in zip(values, others, strict=True)],
+        rows=[(name, value, others.get(name, "")) for name, value in values],
     )
 
 
 @functools.lru_cache(maxsize=4)
-def _kept(scenario: Scenario) -> tuple[Run, list[str]]:
+def _kept(scenario: Scenario) -> tuple[Run, dict[str, str]]:
     """A run and the values that it tells: those of a pinned setting do not change while another one is moved."""
     run = simulate(scenario)
-    return run, [value for _, value in summary_rows(run)]
+    return run, dict(summary_rows(run))
 
 
 def with_channel_of(pinned: Scenario, scenario: Scenario) -> Scenario:
@@ -93,3 +96,19 @@ def summary_rows(run: Run) -> Iterator[tuple[str, str]]:
         return
     for criterion in CRITERIA:
         yield from criterion.at_once(facts)
+    widths = widths_of(run.scenario.error_detector)
+    if widths is not None:
+        yield "One outage in the corridor", _rough_outage(run, widths)
+
+
+def _rough_outage(run: Run, widths: Widths) -> str:
+    """Longest single outage within a corridor, from some places of the lap, in words."""
+    relay = run.scenario.relay
+    if not (relay.uplink.is_direct and relay.downlink.is_direct):
+        return "no answer: messages take time or depend on the place"
+    n = roughly(LapLoop(run.scenario, widths))
+    if n is None:
+        return f"any up to {LONGEST} slots, from {FEW_PLACES} places of the lap"
+    if n < 0:
+        return "none: the AGV is outside without any"
+    return f"about {n} slots ({n * run.ts * 1e3:g} ms), from {FEW_PLACES} places of the lap"

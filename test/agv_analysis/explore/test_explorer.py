@@ -126,6 +126,15 @@ def test_the_pinned_setting_meets_the_same_outages(base: Scenario) -> None:
     assert simulate(with_channel_of(slower, now)).ts == 0.01
 
 
+def test_a_corridor_is_answered_at_every_move(base: Scenario) -> None:
+    """From some places of the lap: on a line all of them are the same, and a v T_s n (n + 1) / 2 = 0.25 m decides."""
+    with_corridor = base.with_settings(["error_detector.corridor=0.25", "error_detector.track=line"])
+    found = {name: value for name, value, _ in respond(with_corridor).rows}
+    assert found["One outage in the corridor"].startswith("about 27 slots")
+    pinned = {name: other for name, _, other in respond(with_corridor, base).rows}
+    assert pinned["One outage in the corridor"] == ""
+
+
 def test_both_runs_are_drawn(base: Scenario) -> None:
     found = respond(base, dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=5.0)))
     assert [trace["name"] for trace in found.track["data"]] == ["reference", "AGV", "pose lost", "pinned"]
