@@ -137,13 +137,14 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
 
     table = Table(box=None, pad_edge=False)
     table.add_column("AGV", no_wrap=True)
-    for heading in ("steps", "lost", "outage", "to 1 cm", "deviation [m]", "twins"):
+    for heading in ("steps", "lost", "outage", "to 1 cm", "deviation [m]", "of corridor", "twins"):
         table.add_column(escape(heading), justify="right")
     table.add_column("verdict")
     for one in vehicles:
         table.add_row(
             one.vehicle, str(one.steps), _text(one.loss_rate, ".2%"), _text(one.longest_outage, "d"),
-            _text(one.settle_1cm_steps, "d"), _text(one.deviation_max, ".3g"), _text(one.contraction, ".2g"),
+            _text(one.settle_1cm_steps, "d"), _text(one.deviation_max, ".3g"),
+            _text(one.corridor_share, ".0%"), _text(one.contraction, ".2g"),
             one.verdict or "-",
         )  # fmt: skip
     console, found = Console(highlight=False), instability(vehicles)

@@ -14,13 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.corridor.outages_seen import recorded_outages
+from agv_analysis.corridor.widths import widths_of
 from agv_analysis.metrics.confidence import CONFIDENCE, clopper_pearson
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.batch import TWIN_OFFSET
-from agv_analysis.stability.analysis import analyse
+from agv_analysis.stability.analysis import Analysis, analyse
 from agv_analysis.stability.empirical import distances, is_unstable, left_without_losses
 from agv_analysis.stability.repeated_run import settles_without_losses
 from agv_plant.channels.registry import SHARED
@@ -113,6 +115,11 @@ class Vehicle:
     deviation_rms: float | None = None
     speed_max: float | None = None
     """Largest |v| that its controller asked for [m/s]."""
+    corridor_share: float | None = None
+    """Largest share of its corridor that it used, above 1 outside; None without a corridor, as are the next two."""
+    outages_outside: int | None = None
+    """Outages after which it was outside, and with 95 % confidence the share of all outages that lead there at most."""
+    p_outage_at_most: float | None = None
     verdict: str | None = None
     verdict_criterion: str | None = None
     verdict_reason: str | None = None
@@ -142,12 +149,27 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
         deviation_p99=figures["deviation"]["p99"],
         deviation_rms=figures["deviation"]["rms"],
         speed_max=figures["speed"]["max"],
+        **_corridor(found),
         verdict=figures["verdict"],
         verdict_criterion=figures["verdict_criterion"],
         verdict_reason=figures["verdict_reason"],
         contraction=contraction if contraction is not None and math.isfinite(contraction) else None,
         unstable=_is_unstable(found.run, contraction),
     )
+
+
+def _corridor(found: Analysis) -> dict[str, Any]:
+    """What the recording shows of its corridor, if it has one."""
+    widths, first = widths_of(found.run.scenario.error_detector), found.convergence.initial
+    if widths is None:
+        return {}
+    settled = 0 if first.has_nothing_to_settle else first.settle_1cm_steps
+    seen = recorded_outages(found.run, widths, None, settled)
+    return {
+        "corridor_share": seen.largest if math.isfinite(seen.largest) else None,
+        "outages_outside": seen.left,
+        "p_outage_at_most": seen.at_most,
+    }
 
 
 def _is_unstable(run: Run, contraction: float | None) -> bool | None:

@@ -149,7 +149,8 @@ def differences(recorded: Run, simulated: Run) -> list[str]:
     ]
 
 
-LOSSY = (*SHARED, "relay.downlink.model=bernoulli", "relay.downlink.p=0.2", "plant.duration=2.0", "plant.noise_xy=0.01")
+LOSSY = (*SHARED, "relay.downlink.model=bernoulli", "relay.downlink.p=0.2", "plant.duration=2.0", "plant.noise_xy=0.01",
+         "error_detector.corridor=0.1")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +172,17 @@ def test_a_vehicle_s_recording_is_its_simulation(driven: Path, name: str) -> Non
     assert not recorded.unexplained
     assert recorded.notes == ()
     assert differences(recorded, simulate(scenario)) == []
+
+
+def test_a_vehicle_is_held_against_its_corridor(driven: Path) -> None:
+    judged, run = judge("agv_02", 400, "", driven / "agv_02"), read_run(driven / "agv_02")
+    distance = np.hypot(*(run.pose - run.reference[:, :3])[:, :2].T)
+    assert judged.corridor_share is not None
+    assert judged.corridor_share <= distance.max() / 0.1
+    assert judged.outages_outside is not None
+    assert judged.p_outage_at_most is not None
+    assert (judged.outages_outside > 0) == (judged.corridor_share > 1.0)
+    assert judged.p_outage_at_most > 0.0
 
 
 def test_with_a_process_for_each_the_recordings_are_the_same_bytes(driven: Path, tmp_path: Path) -> None:
