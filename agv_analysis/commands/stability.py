@@ -194,6 +194,7 @@ def _gains_to_json(best: dict[str, GainChoice], why_no_gain: str) -> dict[str, A
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:
     """Write and draw the map over two axes."""
     from agv_analysis.commands.progress import step_bar
+    from agv_analysis.corridor.corridor_map import with_corridor
     from agv_analysis.report.margin_map_files import draw, write_csv
     from agv_analysis.stability.margin_map import margin_map, ranges_of
     from agv_ros.errors import UserError
@@ -203,7 +204,7 @@ def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Pa
         raise UserError(f"--map takes two axes with a comma between them, as in kx,ts; got {axes!r}")
     first, second = ranges_of(scenario, names, points)
     with step_bar(points * points, "computing the map") as progress:
-        found = margin_map(scenario, (names[0], names[1]), first, second, progress)
+        found = with_corridor(margin_map(scenario, (names[0], names[1]), first, second, progress), scenario)
     write_csv(csv_file, found)
     draw(picture, found)
     click.echo(f"map:     {csv_file}\npicture: {picture}")

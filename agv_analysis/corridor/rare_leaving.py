@@ -18,7 +18,7 @@ from agv_plant.random_stream import DRAWS
 _BASE, _LONGEST = 200_000, 20_000
 """Slots of the run that looks for the first level, and those that others may last."""
 
-_RUNS, _FEWEST, _MOST = 8000, 100, 1000
+_RUNS, _FEWEST, _MOST = 5000, 100, 1000
 """Runs of a replicate in all, and from each level at least and at most."""
 
 _CROSSINGS = 400
@@ -78,13 +78,13 @@ def leaving_rate(loop: LapLoop, chain: Chain, n: int, seed: int) -> Rate:
 
 def _levels(loop: LapLoop, chain: Chain, n: int, base: int) -> list[float]:
     """Shares of the corridor, increasing to 1."""
-    first = max([1, *(length for length in range(1, n + 1) if _outages_of(chain, length) * base >= _CROSSINGS)])
+    first = max([1, *(length for length in range(1, n + 1) if outages_of(chain, length) * base >= _CROSSINGS)])
     shares = loop.shares_in_outage(n + 1)
     levels = [shares[age] for age in age_levels(chain, n + 1, first)[:-1]]
     return [*(float(share) for share in np.unique(levels) if share < 1.0), 1.0]
 
 
-def _outages_of(chain: Chain, n: int) -> float:
+def outages_of(chain: Chain, n: int) -> float:
     """Share of the slots that are the n-th of an outage."""
     state, lost = (chain.stationary * chain.delivery) @ chain.transition, 1.0 - chain.delivery
     for _ in range(n - 1):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from agv_analysis.corridor.corridor_map import TITLES
 from agv_analysis.stability.margin_map import MarginMap, map_columns
 from agv_ros.errors import UserError
 
@@ -17,24 +18,25 @@ def write_csv(path: Path, found: MarginMap) -> None:
             rows.writerow([*found.axes, *found.margins])
             for i, x in enumerate(found.first.tolist()):
                 for j, y in enumerate(found.second.tolist()):
-                    rows.writerow([x, y, *(int(n[i, j]) for n in found.margins.values())])
+                    rows.writerow([x, y, *(n[i, j].item() for n in found.margins.values())])
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def draw(path: Path, found: MarginMap) -> None:
     """A panel for each margin. Raises UserError if the file cannot be written or its kind is unknown."""
-    from matplotlib.colors import SymLogNorm
+    from matplotlib.colors import Normalize, SymLogNorm
     from matplotlib.figure import Figure
 
-    columns = map_columns()
-    figure = Figure(figsize=(5.0 * len(columns), 4.2), layout="constrained")
-    for axes, column in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns, strict=True):
-        n = found.margins[column.name]
-        mesh = axes.pcolormesh(
-            found.second, found.first, n, norm=SymLogNorm(1.0, vmin=-1.0, vmax=max(10.0, float(n.max())))
-        )
-        axes.set(xlabel=found.labels[1], ylabel=found.labels[0], title=column.title)
+    titles = {**{column.name: column.title for column in map_columns()}, **TITLES}
+    figure = Figure(figsize=(5.0 * len(found.margins), 4.2), layout="constrained")
+    for axes, (name, n) in zip(
+        figure.subplots(1, len(found.margins), squeeze=False)[0], found.margins.items(), strict=True
+    ):
+        is_share = n.dtype.kind == "f"
+        norm = Normalize(0.0, 1.0) if is_share else SymLogNorm(1.0, vmin=-1.0, vmax=max(10.0, float(n.max())))
+        mesh = axes.pcolormesh(found.second, found.first, n, norm=norm)
+        axes.set(xlabel=found.labels[1], ylabel=found.labels[0], title=titles[name])
         for values, scale in ((found.second, axes.set_xscale), (found.first, axes.set_yscale)):
             scale("log" if values.min() > 0.0 and values.max() >= 10.0 * values.min() else "linear")
         figure.colorbar(mesh, ax=axes)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ class MarginMap:
     """The axes with their units."""
     first: Floats
     second: Floats
-    margins: dict[str, Ints]
+    margins: dict[str, NDArray[Any]]
     """By the criterion's column, each of shape (rows, columns)."""
 
 
