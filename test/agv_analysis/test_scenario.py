@@ -120,6 +120,7 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
 
 ALONE = {
     "track", "wait_for_subscribers", "stop_timeout", "frame_prefix", "plan_steps", "downlink_policy", "look_ahead",
+    "stamp_window",
     *(f"{link}.{name}" for link in ("uplink", "downlink") for name in ("schedule", "hole_circles", "hole_polygons")),
 }  # fmt: skip
 """What a file may not set for one node without setting something else."""
