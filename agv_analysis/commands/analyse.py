@@ -68,7 +68,7 @@ def command(
     draw(run, where)
     print_table(analysis)
     scenario = run.scenario.with_settings(corridor_settings(corridor_width, corridor_along), "--corridor")
-    within = print_corridor(analysis, scenario, False, laps) if run.gains_known else None
+    within = print_corridor(analysis, scenario, False, laps)
     click.echo(f"bag:     {bag}\npicture: {where}")
     report_on(analysis, report, figures, within)
     if json_file is not None:

@@ -10,35 +10,40 @@ import numpy as np
 
 from agv_analysis.corridor.corridor import Corridor, corridor
 from agv_analysis.corridor.outages_seen import RecordedOutages, recorded_outages
-from agv_analysis.corridor.widths import widths_of
+from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.link.channel_fit import ChannelFit, Estimate
 from agv_analysis.link.transitions import interval_of
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.stability.analysis import Observations
+from agv_analysis.stability.analysis import GAINS_UNKNOWN, Observations
 from agv_plant.parameters import ChannelParameters
+from agv_ros.errors import UserError
 
 
 @dataclass(frozen=True)
 class CorridorOfRun:
     """What was seen, and what is to be expected."""
 
+    widths: Widths
     seen: RecordedOutages
-    expected: Corridor
+    expected: Corridor | None
+    """None where the loop cannot be simulated: its gains or its track are not known, as the notes say."""
     channel: str
     """Under which channel, in words."""
     notes: tuple[str, ...]
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Name and value of each figure, in plain text."""
-        yield from self.expected.rows()
-        yield "Under the channel", self.channel
+        if self.expected is not None:
+            yield from self.expected.rows()
+            yield "Under the channel", self.channel
         yield from self.seen.rows()
 
     def to_json(self) -> dict[str, Any]:
         """The figures by name; SI units, intervals of 95 %."""
-        found = self.expected.to_json()
-        return {**found, "channel": self.channel, "recorded": self.seen.to_json(), "notes": list(self.notes)}
+        found = {"half_width": self.widths.half_width} if self.expected is None else self.expected.to_json()
+        channel = self.channel or None
+        return {**found, "channel": channel, "recorded": self.seen.to_json(), "notes": list(self.notes)}
 
 
 def corridor_of_run(
@@ -49,19 +54,28 @@ def corridor_of_run(
     widths, fit, first = widths_of(scenario.error_detector), analysis.fit, analysis.convergence.initial
     if widths is None:
         return None
-    expected = corridor(scenario if is_known else with_fitted_channel(scenario, fit), laps, progress)
-    assert expected is not None
-    notes = [*expected.notes]
-    if not is_known:
+    expected, notes = None, []
+    if analysis.run.gains_known:
+        try:
+            expected = corridor(scenario if is_known else with_fitted_channel(scenario, fit), laps, progress)
+        except UserError as error:  # a recording may come without its track
+            notes.append(f"only what was seen, for {error}")
+    else:
+        notes.append(f"only what was seen, for {GAINS_UNKNOWN}")
+    if expected is not None:
+        notes += expected.notes
+    if expected is not None and not is_known:
         expected = _with_doubts(expected, fit)
         if not fit.goodness.fits:
             notes.append("the outages are not those of the fitted channel, so its probabilities are a guess")
         if not scenario.relay.uplink.is_direct:
             notes.append("the fitted channel knows no delay")
     settled = 0 if first.has_nothing_to_settle else first.settle_1cm_steps
-    seen = recorded_outages(analysis.run, widths, expected.n_single, settled)
+    n_single = None if expected is None else expected.n_single
+    seen = recorded_outages(analysis.run, widths, n_single, settled)
     channel = scenario.relay.uplink.model + (" of the scenario" if is_known else "")
-    return CorridorOfRun(seen, expected, channel if is_known else _fitted(fit), (*notes, *seen.warnings))
+    of_whom = "" if expected is None else channel if is_known else _fitted(fit)
+    return CorridorOfRun(widths, seen, expected, of_whom, (*notes, *seen.warnings))
 
 
 def with_fitted_channel(scenario: Scenario, fit: ChannelFit) -> Scenario:

@@ -76,13 +76,13 @@ def render(analysis: Observations, within: CorridorOfRun | None = None) -> str:
 def all_panels(analysis: Observations, within: CorridorOfRun | None = None) -> list[Panel]:
     """The panels of a run, with its corridor drawn, if there is one, on the track and over a lap."""
     drawn = list(panels(analysis))
-    if within is None:
+    if within is None or within.expected is None:
         return drawn
+    expected = within.expected
     with_edges = (
-        replace(panel, lines=(*edges(within.expected), *panel.lines)) if panel.key == "track" else panel
-        for panel in drawn
+        replace(panel, lines=(*edges(expected), *panel.lines)) if panel.key == "track" else panel for panel in drawn
     )
-    return [*with_edges, corridor_panel(within.expected)]
+    return [*with_edges, corridor_panel(expected)]
 
 
 def fill(template: str, figures: dict[str, Any], data: dict[str, Any], **content: Any) -> str:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from agv_analysis.corridor.corridor_of_run import with_fitted_channel
+from agv_analysis.corridor.corridor_of_run import corridor_of_run, with_fitted_channel
 from agv_analysis.corridor.outages_seen import geometric_tail, recorded_outages
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.link.channel_fit import fit_channel
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.analysis import observe
 from test.agv_analysis.corridor.test_single_outage import scenario
 
 WIDE = Widths(0.25, np.inf, np.inf)
@@ -70,3 +72,16 @@ def test_a_recording_on_the_command_line(agv_ncs, tmp_path: Path) -> None:  # ty
     status, said = agv_ncs("analyse", "bags/sample", "--corridor", "0")
     assert status == 2
     assert "'--corridor'" in said
+
+
+def test_without_gains_only_what_was_seen_is_said() -> None:
+    chosen = scenario("plant.duration=10.0", "error_detector.corridor=0.25")
+    run = dataclasses.replace(simulate(chosen), gains_known=False)
+    found = corridor_of_run(observe(run), chosen, is_known=False)
+    assert found is not None
+    assert found.expected is None
+    said = found.to_json()
+    assert (said["half_width"], said["channel"]) == (0.25, None)
+    assert said["recorded"]["outages"] == found.seen.outages > 10
+    assert "gains are not known" in said["notes"][0]
+    assert [name for name, _ in found.rows()] == ["Seen in the run", "Proved by the run"]
