@@ -254,7 +254,7 @@ def test_numba_changes_nothing(package: dict[str, str], tmp_path: Path) -> None:
 def test_a_gain_of_it_can_be_swept(package: dict[str, str], tmp_path: Path) -> None:
     cli(
         package, "sweep", PAPER, *ALL.options, "--vary", "controller.integral.ki=0:8:3", "--seeds", "2",
-        "--out", tmp_path / "sweep",
+        "--no-verdicts", "--out", tmp_path / "sweep",
     )  # fmt: skip
     points = np.genfromtxt(tmp_path / "sweep/points.csv", delimiter=",", names=True)
     assert points["controllerintegralki"].tolist() == [0.0, 4.0, 8.0]
