@@ -126,7 +126,7 @@ class SqliteFile:
             if not isinstance(number, int):
                 self.findings.add("row that describes no topic, left out", is_loss=True)
                 continue
-            encoding, text = definitions.get(_text(kind), ("ros2msg", ""))
+            encoding, text = definitions.get(_text(kind), ("", ""))
             self.schemas[number] = Schema(number, _text(kind), encoding, text.encode())
             about = {QOS: _text(qos), TYPE_HASH: _text(type_hash)}
             self.channels[number] = Channel(number, number, _text(name), _text(form), about)

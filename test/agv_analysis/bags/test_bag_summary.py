@@ -119,3 +119,12 @@ def test_attachments_services_and_missing_definitions(
     assert "service /add (my_srvs/srv/Add): 3 events" in result.stdout
     assert "definition missing: my_srvs/srv/Add_Event, of /add/_service_event" in result.stdout
     assert "recorded by ROS 2 humble" in result.stdout
+
+
+def test_a_type_that_a_database_does_not_define_is_not_taken_for_one_without_members(
+    make_database: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Its first message is all zeros, as that of a type without members is."""
+    counted = [("/mine", "my_msgs/msg/Count", k, b"\0\1\0\0" + k.to_bytes(4, "little")) for k in range(5)]
+    result = CliRunner().invoke(main, ["bag", "info", str(make_database(tmp_path / "c.db3", part=counted))])
+    assert "definition missing: my_msgs/msg/Count, of /mine" in result.stdout
