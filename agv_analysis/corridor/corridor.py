@@ -15,6 +15,7 @@ from agv_analysis.corridor.outer_tube import Tube, applies_to, with_remainder
 from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, single_outage
 from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stationary_deviation
 from agv_analysis.corridor.widths import Widths, widths_of
+from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
@@ -130,27 +131,27 @@ class Corridor:
         found, sequence, single = self.leaving, self.sequence, self.single
         return {
             "half_width": self.widths.half_width,
-            "half_width_along": _finite(min(self.widths.distance, self.widths.along)),
+            "half_width_along": finite(min(self.widths.distance, self.widths.along)),
             "n_single": self.n_single,
             "n_single_reason": self._why_no_single(),
-            "single_deviation": None if single is None else _finite(single.deviation),
+            "single_deviation": None if single is None else finite(single.deviation),
             "worst_place": None if single is None else {
                 "step": single.step, "time_s": single.step * self.ts, "x": single.x, "y": single.y,
             },
             "n_any": self.n_any,
             "n_any_reason": self.n_any_reason or None,
             "worst_sequence": None if sequence is None else {
-                "outages": sequence.lengths, "step": sequence.step, "deviation": _finite(sequence.deviation),
+                "outages": sequence.lengths, "step": sequence.step, "deviation": finite(sequence.deviation),
             },
             "n_any_proved": self.n_any_proved,
             "n_any_proved_reason": self.tube_reason or None,
             "tube_deviation": None if self.tube is None else self.tube.deviation,
             "tube_deviation_second_order": None if self.covering is None else self.covering.deviation,
-            "rms_deviation": None if self.stationary is None else _finite(self.stationary.rms),
+            "rms_deviation": None if self.stationary is None else finite(self.stationary.rms),
             "rms_deviation_reason": self.stationary_reason or None,
-            "rms_along": None if self.stationary is None else _finite(self.stationary.rms_along),
-            "rms_across": None if self.stationary is None else _finite(self.stationary.rms_across),
-            "rms_simulated": _finite(found.rms),
+            "rms_along": None if self.stationary is None else finite(self.stationary.rms_along),
+            "rms_across": None if self.stationary is None else finite(self.stationary.rms_across),
+            "rms_simulated": finite(found.rms),
             **_estimates("p_lap", found.p_lap),
             **_estimates("p_hour", found.p_hour),
             **_estimates("mean_time_s", found.mean_time),
@@ -308,12 +309,7 @@ def _seconds(value: float) -> str:
     return next((f"{value / size:.3g} {unit}" for size, unit in _UNITS if value >= 2.0 * size), f"{value:.3g} s")
 
 
-def _finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if math.isfinite(value) else None
-
-
 def _estimates(name: str, found: Estimate | None) -> dict[str, Any]:
     if found is None:
         return {name: None, f"{name}_interval": None}
-    return {name: _finite(found.value), f"{name}_interval": [_finite(found.low), _finite(found.high)]}
+    return {name: finite(found.value), f"{name}_interval": [finite(found.low), finite(found.high)]}

@@ -16,6 +16,7 @@ import numpy as np
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.leaving import LAPS, leaving
 from agv_analysis.corridor.widths import widths_of
+from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
@@ -61,8 +62,8 @@ class Kept:
         ends = (self.width.low, self.width.high)
         return {
             "confidence": self.confidence,
-            "narrowest_half_width": _finite(self.width.value),
-            "narrowest_half_width_interval": [_finite(end) for end in ends],
+            "narrowest_half_width": finite(self.width.value),
+            "narrowest_half_width_interval": [finite(end) for end in ends],
             "largest_speed": self.speed,
             "largest_speed_reason": self.speed_reason or None,
             "laps": self.laps,
@@ -130,8 +131,3 @@ def _largest_speed(
         middle = math.sqrt(slow * fast)
         slow, fast = (middle, fast) if keeps(middle) else (slow, middle)
     return slow, ""
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if math.isfinite(value) else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from agv_analysis.corridor.widths import Widths
+from agv_analysis.metrics.error_metrics import body_errors
 from agv_analysis.run import Floats
 
 
@@ -13,9 +14,8 @@ def path_deviation(pose: Floats, reference: Floats) -> tuple[Floats, Floats]:
 
     Poses of shape (N, 3) and the reference, shape (N, 3) or with more columns, in frame `map`.
     """
-    dx, dy = (pose[:, :2] - reference[:, :2]).T
-    cos, sin = np.cos(reference[:, 2]), np.sin(reference[:, 2])
-    return cos * dx + sin * dy, cos * dy - sin * dx
+    along, across, _ = body_errors(pose, reference[:, :3]).T  # where the AGV is, seen from the reference
+    return along, across
 
 
 def along_and_across(errors: Floats) -> tuple[Floats, Floats]:

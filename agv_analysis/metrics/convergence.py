@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.json_values import finite
 from agv_analysis.metrics.bands import CRITICAL_TIME, NEGLIGIBLE, SHARE, TOLERANCE
 from agv_analysis.metrics.error_metrics import (
     ErrorMetrics,
@@ -88,24 +89,19 @@ class Convergence:
         return {
             "settle_1cm_steps": self.settle_1cm_steps,
             "settle_2pct_steps": self.settle_2pct_steps,
-            "overshoot": _finite(self.overshoot),
+            "overshoot": finite(self.overshoot),
             "damping": self.damping,
             "convergence_of": self.initial.of,
             "convergence_reason": self.initial.reason or None,
             "last_excursion_seconds": None if self.excursion is None else self.excursion.seconds,
             "last_excursion_after": None if self.excursion is None else self.excursion.after,
-            "initial_error": _finite(self.position.initial),
-            "final_error": _finite(self.position.final),
-            "max_error": _finite(self.position.peak),
-            "max_error_after_settling": _finite(self.max_error_after_settling),
-            "iae": _finite(self.y.iae),
-            "ise": _finite(self.y.ise),
+            "initial_error": finite(self.position.initial),
+            "final_error": finite(self.position.final),
+            "max_error": finite(self.position.peak),
+            "max_error_after_settling": finite(self.max_error_after_settling),
+            "iae": finite(self.y.iae),
+            "ise": finite(self.y.ise),
         }
-
-
-def _finite(value: float | None) -> float | None:
-    """JSON has no infinity."""
-    return value if value is not None and np.isfinite(value) else None
 
 
 def convergence(run: Run, critical_time: float = CRITICAL_TIME) -> Convergence:

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.json_values import finite
 from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.metrics.initial_error import TWIN, InitialError
-from agv_analysis.metrics.outages import Outage, longest_outage_between
+from agv_analysis.metrics.outages import Outage, longest_outage_between, outage_rows
 from agv_analysis.run import Floats, Run
 from agv_analysis.simulation.twin_on_reference import poses_without_losses
+from agv_cloud.tracking_error import tracking_error
 
 WORST = 5
 """So many of the largest deviations are listed."""
@@ -49,10 +51,10 @@ class Peak:
             "seconds": self.seconds,
             "x": self.x,
             "y": self.y,
-            "distance": _finite(self.distance),
-            "along": _finite(self.along),
-            "across": _finite(self.across),
-            "from_lossless": _finite(self.from_lossless),
+            "distance": finite(self.distance),
+            "along": finite(self.along),
+            "across": finite(self.across),
+            "from_lossless": finite(self.from_lossless),
             "link": None if self.outage is None else self.outage.link,
             "outage_slots": None if self.outage is None else self.outage.slots,
             "cause": None if self.outage is None else self.outage.cause or None,
@@ -89,21 +91,16 @@ class Deviation:
         """The figures by name; SI units; null: infinite."""
         return {
             "deviation": {
-                "max": _finite(self.largest),
-                "p99": _finite(self.p99),
-                "rms": _finite(self.rms),
+                "max": finite(self.largest),
+                "p99": finite(self.p99),
+                "rms": finite(self.rms),
                 "since_seconds": self.since_seconds,
                 "reason": self.reason or None,
                 "diverged": self.is_diverged,
                 "worst": [peak.to_json() for peak in self.worst],
             },
-            "speed": {"max": _finite(self.speed), "turn_rate_max": _finite(self.turn_rate)},
+            "speed": {"max": finite(self.speed), "turn_rate_max": finite(self.turn_rate)},
         }
-
-
-def _finite(value: float | None) -> float | None:
-    """JSON has no infinity."""
-    return value if value is not None and np.isfinite(value) else None
 
 
 def deviation(run: Run, initial: InitialError) -> Deviation:
@@ -118,7 +115,7 @@ def deviation(run: Run, initial: InitialError) -> Deviation:
         largest=float(seen.max()),
         p99=float(np.percentile(seen, 99.0, method="inverted_cdf")),
         rms=root_mean_square(seen),
-        worst=tuple(_peaks(run, initial, offset, distance, begin)) if seen.max() <= DIVERGED else (),
+        worst=tuple(_peaks(run, initial, distance, begin)) if seen.max() <= DIVERGED else (),
         speed=_largest(run.command[:, 0]),
         turn_rate=_largest(run.command[:, 1]),
     )
@@ -132,9 +129,8 @@ def _begin(run: Run, initial: InitialError, distance: Floats) -> tuple[int, str]
         return int(np.searchsorted(run.k, run.k[0] + initial.settle_1cm_steps)), ""
     near = np.flatnonzero(distance < TOLERANCE)
     if len(near) and initial.of != TWIN:
-        return int(
-            near[0]
-        ), "from the first step below 1 cm on, since it is not known when the initial error has settled"
+        why = "from the first step below 1 cm on, since it is not known when the initial error has settled"
+        return int(near[0]), why
     return 0, "of the whole run, since its initial error does not settle"
 
 
@@ -152,9 +148,10 @@ def _largest(values: Floats) -> float:
     return float(sent.max()) if len(sent) else float("nan")
 
 
-def _peaks(run: Run, initial: InitialError, offset: Floats, distance: Floats, begin: int) -> list[Peak]:
+def _peaks(run: Run, initial: InitialError, distance: Floats, begin: int) -> list[Peak]:
     """The largest peaks from row `begin` on."""
     lossless = poses_without_losses(run)[:, :2] if initial.of == TWIN else None
+    outages = outage_rows(run)
     free = np.arange(len(distance)) >= begin
     found: list[Peak] = []
     while len(found) < WORST:
@@ -164,7 +161,7 @@ def _peaks(run: Run, initial: InitialError, offset: Floats, distance: Floats, be
         first, last = _stretch(distance, row, begin)
         if free[first : last + 1].all():
             apart = None if lossless is None else float(np.hypot(*(run.pose[row, :2] - lossless[row])))
-            found.append(_peak(run, offset, row, first, float(distance[row]), apart))
+            found.append(_peak(run, row, float(distance[row]), apart, longest_outage_between(outages, first, row)))
         free[first : last + 1] = False
     return found
 
@@ -176,17 +173,16 @@ def _stretch(distance: Floats, row: int, begin: int) -> tuple[int, int]:
     return begin + (int(low[-1]) + 1 if len(low) else 0), row + int(high[0]) - 1 if len(high) else len(distance) - 1
 
 
-def _peak(run: Run, offset: Floats, row: int, first: int, distance: float, apart: float | None) -> Peak:
-    x, y, theta = run.reference[row, :3].tolist()
-    cos, sin = np.cos(theta), np.sin(theta)
-    dx, dy = offset[row].tolist()
+def _peak(run: Run, row: int, distance: float, apart: float | None, outage: Outage | None) -> Peak:
+    reference = run.reference[row, :3].tolist()
+    along, across, _ = tracking_error(*run.pose[row].tolist(), *reference)  # of the AGV, seen from the reference
     return Peak(
         seconds=float(run.time[row] - run.time[0]),
-        x=x,
-        y=y,
+        x=reference[0],
+        y=reference[1],
         distance=distance,
-        along=float(cos * dx + sin * dy),
-        across=float(cos * dy - sin * dx),
+        along=along,
+        across=across,
         from_lossless=apart,
-        outage=longest_outage_between(run, first, row),
+        outage=outage,
     )

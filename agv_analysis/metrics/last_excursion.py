@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agv_analysis.metrics.bands import TOLERANCE
-from agv_analysis.metrics.outages import longest_outage_between
+from agv_analysis.metrics.outages import longest_outage_between, outage_rows
 from agv_analysis.run import Floats, Run
 
 
@@ -38,7 +38,7 @@ def last_excursion(run: Run, distance: Floats, left: Floats | None) -> LastExcur
     first = int(inside_before[-1]) + 1 if len(inside_before) else 0
     is_over = last + 1 < len(run)
     seconds = float(run.time[last + 1 if is_over else last] - run.time[0])
-    outage = longest_outage_between(run, first, last)
+    outage = longest_outage_between(outage_rows(run), first, last)
     is_initial = first == 0 and outage is None if left is None else bool(left[last] >= 0.5 * distance[last])
     after = None if is_initial or outage is None else outage.slots
     return LastExcursion(seconds, is_over, after, is_initial)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,20 +173,42 @@ class Outage:
     """What lost its first message: the channel's model, or `outage` if its schedule says so; empty if unknown."""
 
 
-def longest_outage_between(run: Run, first: int, last: int) -> Outage | None:
-    """The longest outage, of either link, that acts in the rows `first` to `last` of a run; None without one.
+class OutageRows(NamedTuple):
+    """All outages of one link of a run, each array of shape (M,), in the order of time."""
 
-    A loss in slot k acts on the pose of step k + 1.
+    link: str
+    begins: Steps
+    """Rows of their first slots."""
+    k: Steps
+    """Steps of these."""
+    lengths: Steps
+    causes: list[str]
+    """As `Outage.cause`."""
+
+
+def outage_rows(run: Run) -> tuple[OutageRows, OutageRows]:
+    """The outages of a run, of the uplink and of the downlink."""
+
+    def of(link: str, lost: Outcomes, why: LinkSlots | None) -> OutageRows:
+        begins = outage_begins(run.k, lost)
+        causes = [""] * len(begins) if why is None else why.cause[begins].tolist()
+        return OutageRows(link, begins, run.k[begins], outage_lengths(run.k, lost), causes)
+
+    return of("uplink", run.lost, run.uplink), of("downlink", run.downlink_lost, run.downlink)
+
+
+def longest_outage_between(outages: Iterable[OutageRows], first: int, last: int) -> Outage | None:
+    """The longest of `outages`, the first link's of equal ones, that acts in the rows `first` to `last` of their run.
+
+    A loss in slot k acts on the pose of step k + 1. None if none acts.
     """
     found = None
-    for link, lost, why in (("uplink", run.lost, run.uplink), ("downlink", run.downlink_lost, run.downlink)):
-        begins, lengths = outage_begins(run.k, lost), outage_lengths(run.k, lost)
-        acting = np.flatnonzero((begins < last) & (begins + lengths >= first))
+    for one in outages:
+        acting = np.flatnonzero((one.begins < last) & (one.begins + one.lengths >= first))
         if len(acting):
-            chosen = acting[np.argmax(lengths[acting])]
-            begin, slots = int(begins[chosen]), int(lengths[chosen])
-            if found is None or slots > found.slots:
-                found = Outage(link, int(run.k[begin]), slots, "" if why is None else str(why.cause[begin]))
+            i = acting[np.argmax(one.lengths[acting])]
+            if found is None or one.lengths[i] > found.slots:
+                found = Outage(one.link, int(one.k[i]), int(one.lengths[i]), str(one.causes[i]))
     return found
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.link.link_figures import LinkFigures
 from agv_analysis.link.markov_channel import Chain, gilbert_elliott
@@ -56,8 +57,8 @@ class LinkAvailability:
         }
         figures: dict[str, Any] = {}
         for name, estimate in named.items():
-            figures[name] = _finite(estimate.value)
-            figures[f"{name}_interval"] = [_finite(estimate.low), _finite(estimate.high)]
+            figures[name] = finite(estimate.value)
+            figures[f"{name}_interval"] = [finite(estimate.low), finite(estimate.high)]
         return {
             **figures,
             "latency_s": self.latency,
@@ -65,11 +66,6 @@ class LinkAvailability:
             "packets": self.packets,
             "assumption": self.assumption,
         }
-
-
-def _finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if math.isfinite(value) else None
 
 
 def _exactly(value: float) -> Estimate:

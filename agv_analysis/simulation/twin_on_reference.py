@@ -54,11 +54,9 @@ def twin_on_reference(run: Run) -> Twin | str:
 
 def poses_without_losses(run: Run) -> Floats:
     """Where the AGV of a run that has a twin is, from the same start, if each message arrives in its slot; (N, 3)."""
-    fresh = np.zeros_like(run.n_ul)
-    received = np.zeros_like(run.lost)
-    return _driven(replace(run, lost=received, downlink_lost=received, n_ul=fresh, n_dl=fresh), start_of(run.scenario))[
-        0
-    ]
+    fresh, received = np.zeros_like(run.n_ul), np.zeros_like(run.lost)
+    lossless = replace(run, lost=received, downlink_lost=received, n_ul=fresh, n_dl=fresh)
+    return _driven(lossless, start_of(run.scenario))[0]
 
 
 def _driven(run: Run, start: Loop) -> tuple[Floats, Floats]:

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.metrics.convergence import Convergence, convergence
 from agv_analysis.metrics.deviation import Deviation, deviation
@@ -197,11 +196,6 @@ class Analysis(Observations):
         }
 
 
-def _finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if np.isfinite(value) else None
-
-
 def observe(run: Run) -> Observations:
     """What can be seen in a run, be its gains known or not. Raises UserError if the run has no step."""
     seen, converged = outages(run), convergence(run)
@@ -235,7 +229,7 @@ def _fit_to_json(fit: ChannelFit) -> dict[str, Any]:
     return {
         "model": fit.model,
         "p_value": fit.p_value,
-        "mean_burst": _finite(fit.mean_burst),
-        **{name: None if e is None else [*map(_finite, (e.value, e.low, e.high))] for name, e in estimates.items()},
+        "mean_burst": finite(fit.mean_burst),
+        **{name: None if e is None else [*map(finite, (e.value, e.low, e.high))] for name, e in estimates.items()},
         "goodness": fit.goodness.to_json(),
     }

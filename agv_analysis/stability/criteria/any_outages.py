@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from agv_analysis.json_values import finite
 from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.criteria.criterion import (
     PLACES_OF_LONG_LAP,
@@ -14,7 +15,6 @@ from agv_analysis.stability.criteria.criterion import (
     Row,
     RunFacts,
     ScenarioFacts,
-    finite,
     steps_text,
 )
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from agv_analysis.json_values import finite
 from agv_analysis.link import joint_chain
 from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.stability import mean_square_two_links
-from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts, finite, growth_text
+from agv_analysis.stability.criteria.criterion import Criterion, Margin, ScenarioFacts, growth_text
 
 
 def _margins(facts: ScenarioFacts) -> Iterable[Margin]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from agv_analysis.json_values import finite
 from agv_analysis.stability import floquet, lifted
 from agv_analysis.stability.criteria.criterion import (
     PLACES_OF_LONG_LAP,
@@ -17,7 +18,6 @@ from agv_analysis.stability.criteria.criterion import (
     Row,
     RunFacts,
     ScenarioFacts,
-    finite,
     steps_text,
 )
 from agv_analysis.stability.first_border import stable_again

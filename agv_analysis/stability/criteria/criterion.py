@@ -207,11 +207,6 @@ class Criterion:
     map_column: MapColumn | None = None
 
 
-def finite(value: float) -> float | None:
-    """JSON has no infinity."""
-    return value if np.isfinite(value) else None
-
-
 def steps_text(n: int, ts: float) -> str:
     """A number of steps that a scenario can take, with its time."""
     return "does not contract even without outages" if n < 0 else f"{n} steps ({n * ts * 1e3:g} ms)"

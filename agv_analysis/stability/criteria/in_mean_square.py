@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
+from agv_analysis.json_values import finite
 from agv_analysis.link import joint_chain
 from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst
 from agv_analysis.scenario import Scenario
@@ -17,7 +18,6 @@ from agv_analysis.stability.criteria.criterion import (
     Row,
     RunFacts,
     ScenarioFacts,
-    finite,
     growth_text,
 )
 from agv_analysis.stability.first_border import not_monotone

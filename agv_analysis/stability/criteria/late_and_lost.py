@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from agv_analysis.json_values import finite
 from agv_analysis.link.age_chain import AgeChain, age_chain_of, fitted_ages
 from agv_analysis.stability import delayed_mean_square
 from agv_analysis.stability.criteria.criterion import (
@@ -12,7 +13,6 @@ from agv_analysis.stability.criteria.criterion import (
     Margin,
     RunFacts,
     ScenarioFacts,
-    finite,
     growth_text,
     has_late,
 )

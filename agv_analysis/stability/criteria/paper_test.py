@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from agv_analysis.json_values import finite
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import paper
@@ -17,7 +18,6 @@ from agv_analysis.stability.criteria.criterion import (
     Row,
     RunFacts,
     ScenarioFacts,
-    finite,
     steps_text,
 )
 from agv_analysis.stability.derived_loop import is_kanayamas_law

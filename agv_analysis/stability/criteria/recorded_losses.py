@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from agv_analysis.json_values import finite
 from agv_analysis.run import Run
 from agv_analysis.stability import driven_motion, floquet, variable_delay
-from agv_analysis.stability.criteria.criterion import Criterion, Judgement, RunFacts, finite, has_late
+from agv_analysis.stability.criteria.criterion import Criterion, Judgement, RunFacts, has_late
 
 
 def _judge(facts: RunFacts) -> Judgement | None:
