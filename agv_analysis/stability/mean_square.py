@@ -22,11 +22,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_mean_burst
 from agv_analysis.run import Floats
 from agv_analysis.stability.first_border import borders
+from agv_analysis.stability.floquet import drop_sequence
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.moment_growth import SETTLED, moment_growth
 from agv_analysis.stability.products import assign, divide, log_spectral_radius, multiply
@@ -113,6 +115,9 @@ def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, s
     """
     if loop.is_exact and chain.loss_rate < 1.0:  # from the first reception on the edge knows the error
         chain, moments = bernoulli(0.0), None
+    outcomes = _repeated_outcomes(chain)
+    if outcomes is not None:
+        return _growth_of_repeated(loop, outcomes)
     if loop.is_constant and len(chain.delivery) * (loop.size + loop.outputs) ** 2 <= _LARGEST:
         return loop.steps * math.log(spectral_radius(*step_maps(loop), chain))
     if chain.loss_rate == 0.0:  # X(k+1) = A_1 X(k) A_1': eigenvalues are products of two of those of the lap of A_1
@@ -122,6 +127,35 @@ def lap_growth(loop: LinearLoop, chain: Chain, moments: Moments | None = None, s
     if moments is None:
         moments = Moments.unit(loop, len(chain.delivery))
     return growth_over_lap(loop, moments, _drive(loop, chain, moments), settled)
+
+
+def _repeated_outcomes(chain: Chain) -> NDArray[np.bool_] | None:
+    """Which slots are lost of a chain that leaves nothing to chance, over its period; None if it does, or none arrive.
+
+    Second moments by state would cost as many times a lap as the period has slots, for what one trajectory shows.
+    """
+    after = chain.transition.argmax(axis=1)
+    is_certain = np.array_equal(chain.transition, np.eye(len(after))[after]) and bool(
+        np.isin(chain.delivery, (0, 1)).all()
+    )
+    if len(after) == 1 or not is_certain:
+        return None
+    states = [0]
+    while after[states[-1]] != 0 and len(states) < len(after):
+        states.append(int(after[states[-1]]))
+    is_one_cycle = len(states) == len(after) and after[states[-1]] == 0
+    return chain.delivery[states] == 0.0 if is_one_cycle and chain.delivery.any() else None
+
+
+def _growth_of_repeated(loop: LinearLoop, lost: NDArray[np.bool_]) -> float:
+    """Growth of the second moments over a lap if `lost`, shape (P,), repeats: of the places it may begin at the worst."""
+    rows = 1 if loop.is_constant else loop.steps
+    together = math.lcm(rows, len(lost))
+    repeated = np.resize(lost, together)
+    largest = max(
+        float(drop_sequence(loop, np.roll(repeated, begin), 1)[0]) for begin in range(math.gcd(rows, len(lost)))
+    )
+    return 2.0 * largest * (loop.steps / together)
 
 
 def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:

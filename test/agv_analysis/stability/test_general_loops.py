@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from functools import partial
@@ -237,17 +238,38 @@ def test_the_mean_square_over_a_lap_by_its_dense_recursion(kind: str, p: float) 
     assert mean_square.lap_growth(loop, bernoulli(p)) == pytest.approx(dense_growth(loop, p, 4), abs=tolerance)
 
 
+def dense_step(loop: LinearLoop, k: int, chain: Chain) -> Floats:
+    """What step k makes of the second moments of all states of the channel, one above the other."""
+    received, missed = maps_of(loop, k)
+    blocks = [recursion([(g, received), (1.0 - g, missed)]) for g in chain.delivery.tolist()]
+    states = range(len(blocks))
+    return np.block([[chain.transition[i, j] * blocks[i] for i in states] for j in states])
+
+
+CYCLES = ["R", "RL", "RLL", "RRLLRL", "RLLLLLL"]
+
+
+@pytest.mark.parametrize("outcomes", CYCLES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_mean_square_under_outcomes_that_repeat_by_its_dense_recursion(kind: str, outcomes: str) -> None:
+    """The lap has 4 steps, so that the worst of several beginnings counts for some, and laps differ for others."""
+    loop, states = random_loop(kind, 4, 4), len(outcomes)
+    chain = Chain(np.roll(np.eye(states), 1, axis=1), np.array([float(slot == "R") for slot in outcomes]))
+    product = functools.reduce(
+        lambda before, k: dense_step(loop, k, chain) @ before,
+        range(4),
+        np.eye(states * (loop.size + loop.outputs) ** 2),
+    )
+    truth = math.log(np.abs(np.linalg.eigvals(product)).max())
+    assert mean_square.lap_growth(loop, chain) == pytest.approx(truth, abs=1e-6 if "L" in outcomes else 1e-3)
+
+
 @pytest.mark.parametrize("chain", [bernoulli(0.6), gilbert_elliott(0.1, 0.3, 0.2, 0.9)])
 @OF_LAGGED
 def test_the_mean_square_of_a_loop_that_stays_as_it_is(loop: LinearLoop, chain: Chain) -> None:
     """By the dense recursion, and by driving the same loop as a lap of many equal steps."""
-    size = loop.size + loop.outputs
-    received, missed = maps_of(loop, 0)
-    blocks = [
-        recursion([(g, received), (1.0 - g, missed)]) for g in chain.delivery.tolist()
-    ]  # what becomes of the moments of each state
-    dense = np.block([[chain.transition[i, j] * blocks[i] for i in range(len(blocks))] for j in range(len(blocks))])
-    assert dense.shape == (len(blocks) * size**2,) * 2
+    dense = dense_step(loop, 0, chain)
+    assert dense.shape == (len(chain.delivery) * (loop.size + loop.outputs) ** 2,) * 2
     truth = math.log(np.abs(np.linalg.eigvals(dense)).max())
     assert mean_square.lap_growth(loop, chain) == pytest.approx(truth, abs=1e-7)
     driven = as_a_lap(loop, 3000)
