@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_plant.parameters import ChannelParameters, RelayParameters
@@ -118,6 +119,17 @@ def chain_of(channel: ChannelParameters) -> Chain | None:
     if channel.model == "burst":
         return Chain(np.roll(np.eye(channel.n + 1), 1, axis=1), np.eye(channel.n + 1)[0])
     return None
+
+
+def cycle_of(transition: Floats) -> NDArray[np.int64] | None:
+    """The states of a chain in the order in which it goes through them all, for ever; None if it does anything else."""
+    after = transition.argmax(axis=1)
+    if not np.array_equal(transition, np.eye(len(after))[after]):
+        return None
+    states = [0]
+    while after[states[-1]] != 0 and len(states) < len(after):
+        states.append(int(after[states[-1]]))
+    return np.array(states) if len(states) == len(after) and after[states[-1]] == 0 else None
 
 
 def renewal_chain(relay: RelayParameters) -> Chain | None:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
-from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, shortest_mean_burst
+from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, cycle_of, shortest_mean_burst
 from agv_analysis.run import Floats
 from agv_analysis.stability.first_border import borders
 from agv_analysis.stability.floquet import drop_sequence
@@ -134,21 +134,13 @@ def _repeated_outcomes(chain: Chain) -> NDArray[np.bool_] | None:
 
     Second moments by state would cost as many times a lap as the period has slots, for what one trajectory shows.
     """
-    after = chain.transition.argmax(axis=1)
-    is_certain = np.array_equal(chain.transition, np.eye(len(after))[after]) and bool(
-        np.isin(chain.delivery, (0, 1)).all()
-    )
-    if len(after) == 1 or not is_certain:
-        return None
-    states = [0]
-    while after[states[-1]] != 0 and len(states) < len(after):
-        states.append(int(after[states[-1]]))
-    is_one_cycle = len(states) == len(after) and after[states[-1]] == 0
-    return chain.delivery[states] == 0.0 if is_one_cycle and chain.delivery.any() else None
+    states, delivered = cycle_of(chain.transition), chain.delivery == 1.0
+    is_certain = states is not None and bool(np.isin(chain.delivery, (0.0, 1.0)).all()) and bool(delivered.any())
+    return ~delivered[states] if is_certain else None
 
 
 def _growth_of_repeated(loop: LinearLoop, lost: NDArray[np.bool_]) -> float:
-    """Growth of the second moments over a lap if `lost`, shape (P,), repeats: of the places it may begin at the worst."""
+    """Growth of the second moments over a lap if `lost`, shape (P,), repeats: of the places to begin at the worst."""
     rows = 1 if loop.is_constant else loop.steps
     together = math.lcm(rows, len(lost))
     repeated = np.resize(lost, together)

@@ -25,13 +25,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.link.joint_chain import OUTCOMES, JointChain
+from agv_analysis.link.markov_channel import cycle_of
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import growth_over_lap
-from agv_analysis.stability.products import divide
+from agv_analysis.stability.products import assign, divide, largest_entry
 
 POLICIES = ("hold", "zero")
 """Downlink policies that are a Markov jump linear system of (z, h, u); others remember more."""
@@ -49,6 +51,9 @@ def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> floa
     states, size = len(links.transition), maps.shape[-1]
     if loop.is_constant and states * size**2 <= _LARGEST:
         return loop.steps * math.log(np.abs(np.linalg.eigvals(operator(maps[0], links))).max())
+    cycle = cycle_of(links.transition)
+    if cycle is not None and bool(np.isin(links.outcomes, (0.0, 1.0)).all()):
+        return _growth_of_repeated(maps, links.outcomes[cycle].argmax(axis=1), loop.steps)
     moments = np.array(np.broadcast_to(np.eye(size), (states, size, size)), order="C")
     return growth_over_lap(loop, (moments,), lambda steps: float(compiled(_drive_lap)(maps, *links, steps, moments)))
 
@@ -72,6 +77,37 @@ def operator(maps: Floats, links: JointChain) -> Floats:
     rows = np.einsum("so,oij->sij", links.outcomes, squares)
     size = len(links.transition) * squares.shape[1]
     return np.asarray(np.einsum("st,sij->tisj", links.transition, rows).reshape(size, size))
+
+
+def _growth_of_repeated(maps: Floats, outcomes: NDArray[np.int64], steps: int) -> float:
+    """Growth over a lap of so many steps if `outcomes`, shape (P,), repeat: of the places to begin at the worst.
+
+    By one trajectory: second moments by state would cost P times as much.
+    """
+    together = math.lcm(len(maps), len(outcomes))
+    beginnings = range(math.gcd(len(maps), len(outcomes)))
+    return 2.0 * max(_log_spectral_radius(maps, outcomes, begin, together) for begin in beginnings) * (steps / together)
+
+
+def _log_spectral_radius(maps: Floats, outcomes: NDArray[np.int64], begin: int, steps: int) -> float:
+    """Of the product of so many maps from the one at `begin` of the lap on, logarithm; -inf if nothing is left."""
+    product = np.eye(maps.shape[-1])
+    log_scale = compiled(_multiply_through)(maps, outcomes, begin, steps, product)
+    radius = float(np.abs(np.linalg.eigvals(product)).max())
+    return log_scale + math.log(radius) if radius > 0.0 else -math.inf
+
+
+def _multiply_through(maps: Floats, outcomes: NDArray[np.int64], begin: int, steps: int, product: Floats) -> float:
+    """`product` = the maps of the steps after each other times it, to be multiplied by exp(what is returned)."""
+    log_scale, before = 0.0, np.empty_like(product)
+    for k in range(steps):
+        assign(product, before)
+        _multiply(maps[(begin + k) % maps.shape[0], outcomes[k % len(outcomes)]], before, product)
+        largest = largest_entry(product)
+        if largest > 1e100 or 0.0 < largest < 1e-100:
+            divide(product, largest)
+            log_scale += math.log(largest)
+    return log_scale
 
 
 def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: int, moments: Floats) -> float:
@@ -98,10 +134,12 @@ def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: i
             for i in range(size):
                 for j in range(size):
                     moments[t, i, j] = 0.0
-                    for s in range(states):
-                        if transition[s, t] > 0.0:
+            for s in range(states):
+                if transition[s, t] > 0.0:
+                    for i in range(size):
+                        for j in range(size):
                             moments[t, i, j] += transition[s, t] * after[s, i, j]
-                    largest = max(largest, abs(moments[t, i, j]))
+            largest = max(largest, largest_entry(moments[t]))
         if largest > 1e100 or 0.0 < largest < 1e-100:
             for t in range(states):
                 divide(moments[t], largest)

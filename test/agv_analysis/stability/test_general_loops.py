@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
 from functools import partial
@@ -246,6 +245,12 @@ def dense_step(loop: LinearLoop, k: int, chain: Chain) -> Floats:
     return np.block([[chain.transition[i, j] * blocks[i] for i in states] for j in states])
 
 
+def repeating(outcomes: str) -> Chain:
+    """The channel whose slots are received, "R", and lost, "L", in this order, again and again."""
+    delivery = np.array([float(slot == "R") for slot in outcomes])
+    return Chain(np.roll(np.eye(len(outcomes)), 1, axis=1), delivery)
+
+
 CYCLES = ["R", "RL", "RLL", "RRLLRL", "RLLLLLL"]
 
 
@@ -253,13 +258,10 @@ CYCLES = ["R", "RL", "RLL", "RRLLRL", "RLLLLLL"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_mean_square_under_outcomes_that_repeat_by_its_dense_recursion(kind: str, outcomes: str) -> None:
     """The lap has 4 steps, so that the worst of several beginnings counts for some, and laps differ for others."""
-    loop, states = random_loop(kind, 4, 4), len(outcomes)
-    chain = Chain(np.roll(np.eye(states), 1, axis=1), np.array([float(slot == "R") for slot in outcomes]))
-    product = functools.reduce(
-        lambda before, k: dense_step(loop, k, chain) @ before,
-        range(4),
-        np.eye(states * (loop.size + loop.outputs) ** 2),
-    )
+    loop, chain = random_loop(kind, 4, 4), repeating(outcomes)
+    product = np.eye(len(outcomes) * (loop.size + loop.outputs) ** 2)
+    for k in range(4):
+        product = dense_step(loop, k, chain) @ product
     truth = math.log(np.abs(np.linalg.eigvals(product)).max())
     assert mean_square.lap_growth(loop, chain) == pytest.approx(truth, abs=1e-6 if "L" in outcomes else 1e-3)
 
@@ -344,6 +346,24 @@ def test_both_links_over_a_lap_by_the_dense_recursion(kind: str, stops: bool) ->
     truth = math.log(np.abs(np.linalg.eigvals(product)).max())
     links = independent(bernoulli(up), bernoulli(down))
     assert mean_square_two_links.lap_growth(loop, links, stops) == pytest.approx(truth, abs=1e-6)
+
+
+@pytest.mark.parametrize("stops", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_both_links_under_outcomes_that_repeat_by_their_product(kind: str, stops: bool) -> None:
+    """Outcomes of 6 steps on a lap of 4, so that the worse of two beginnings counts."""
+    loop = random_loop(kind, 4, 4)
+    poses, commands = "RLL", "RL"
+    radii = []
+    for begin in range(4):
+        product = np.eye(loop.size + loop.outputs + 2)
+        for k in range(12):
+            product = acted_on(loop, begin + k, poses[k % 3] == "R", commands[k % 2] == "R", stops) @ product
+        radii.append(np.abs(np.linalg.eigvals(product)).max())
+    links = independent(repeating(poses), repeating(commands))
+    assert len(links.transition) == 6
+    truth = 2.0 * math.log(max(radii)) / 3
+    assert mean_square_two_links.lap_growth(loop, links, stops) == pytest.approx(truth, abs=1e-9)
 
 
 @OF_LAGGED
