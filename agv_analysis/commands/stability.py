@@ -159,7 +159,7 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, GainChoice], str]:
 
     None behind a predictor, for another law, for a channel that is no Markov chain or loses all.
     """
-    from agv_analysis.link.markov_channel import chain_of
+    from agv_analysis.link.markov_channel import chain_of, why_no_chain
     from agv_analysis.stability.derived_loop import is_kanayamas_law
     from agv_analysis.stability.gains import best_kx
     from agv_analysis.stability.scenario_loop import lap_of, straight_loop_of
@@ -168,8 +168,7 @@ def _best_gains(scenario: Scenario) -> tuple[dict[str, GainChoice], str]:
     if scenario.error_detector.policy == "predict":
         return {}, "no answer: computed for a pose that is held, not for one that is predicted"
     if chain is None:
-        changes = "is changed by its schedule" if scenario.relay.uplink.schedule else "is no finite Markov chain"
-        return {}, f"no answer: the channel {model} {changes}"
+        return {}, f"no answer: the channel {model} {why_no_chain(scenario.relay.uplink)}"
     if chain.loss_rate >= 1.0:
         return {}, "no answer: the scenario's uplink loses everything"
     # With a gain of 1 the loop's a is how far a commanded speed of 1 m/s moves the AGV in a step.

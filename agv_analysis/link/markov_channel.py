@@ -9,6 +9,7 @@ D = diag(1 - g) and the stationary distribution pi:
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -17,6 +18,9 @@ from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_plant.parameters import ChannelParameters, RelayParameters
+
+MOST_STATES = 1000
+"""A channel with more is judged by what a run of it shows: matrices over all states would not fit into memory."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +32,12 @@ class Chain:
     delivery: Floats
     """g, probability of delivery in each state, shape (m,)."""
 
-    @property
+    @functools.cached_property
     def stationary(self) -> Floats:
         """pi, share of slots in each state, shape (m,)."""
         size = len(self.delivery)
+        if cycle_of(self.transition) is not None:
+            return np.full(size, 1.0 / size)
         equations = np.vstack((self.transition.T - np.eye(size), np.ones(size)))
         return np.asarray(np.linalg.lstsq(equations, np.append(np.zeros(size), 1.0), rcond=None)[0])
 
@@ -103,7 +109,7 @@ def shortest_mean_burst(loss_rate: float) -> float:
 
 
 def chain_of(channel: ChannelParameters) -> Chain | None:
-    """The chain of a channel's parameters; None for a model that is no finite Markov chain.
+    """The chain of a channel's parameters; None for a model that is no Markov chain of at most `MOST_STATES` states.
 
     A single outage (burst with a start_step) is over some day: to the long run the channel is perfect. What a schedule
     changes is no chain.
@@ -116,9 +122,16 @@ def chain_of(channel: ChannelParameters) -> Chain | None:
         return bernoulli(channel.p)
     if channel.model == "gilbert_elliott":
         return gilbert_elliott(channel.p, channel.r, channel.h, channel.k)
-    if channel.model == "burst":
+    if channel.model == "burst" and channel.n < MOST_STATES:
         return Chain(np.roll(np.eye(channel.n + 1), 1, axis=1), np.eye(channel.n + 1)[0])
     return None
+
+
+def why_no_chain(channel: ChannelParameters) -> str:
+    """What keeps a channel from being a chain, as the end of a sentence about it."""
+    if channel.schedule:
+        return "is changed by its schedule"
+    return f"has more than {MOST_STATES} states" if channel.model == "burst" else "is no finite Markov chain"
 
 
 def cycle_of(transition: Floats) -> NDArray[np.int64] | None:

@@ -77,6 +77,9 @@ def operator(received: Floats, missed: Floats, chain: Chain) -> Floats:
 
 def spectral_radius(received: Floats, missed: Floats, chain: Chain) -> float:
     """Growth of the second moments per step of a loop that stays as it is; arguments as of `operator`."""
+    lost = _repeated_outcomes(chain)
+    if lost is not None:
+        return math.exp(2.0 * log_spectral_radius(np.where(lost[:, None, None], missed, received)) / len(lost))
     return float(np.abs(np.linalg.eigvals(operator(received, missed, chain))).max())
 
 

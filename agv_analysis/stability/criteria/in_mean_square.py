@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from agv_analysis.json_values import finite
 from agv_analysis.link import joint_chain
-from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst
+from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst, why_no_chain
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import mean_square, mean_square_two_links
 from agv_analysis.stability.criteria.criterion import (
@@ -75,7 +75,7 @@ def _as_it_is(facts: ScenarioFacts) -> Margin:
     name, label, uplink = "uplink.mean_square_growth", "Uplink as it is, mean square", facts.scenario.relay.uplink
     chain = chain_of(uplink)
     if chain is None:
-        return Margin(name, label, None, reason=f"no answer: the channel {uplink.model} is no finite Markov chain")
+        return Margin(name, label, None, reason=f"no answer: the channel {uplink.model} {why_no_chain(uplink)}")
     if uplink.delays:
         return Margin(name, label, None, reason="no answer: poses are late as well", shown=False)
     growth = mean_square.lap_growth(facts.loop, chain) / facts.loop.steps
@@ -87,7 +87,9 @@ def _burst(facts: ScenarioFacts) -> Margin:
     name, label, uplink = "burst_max.mean_square", "Bursts, mean square", facts.scenario.relay.uplink
     chain = chain_of(uplink)
     if chain is None:
-        reason = f"no answer: the loss rate of the channel {uplink.model} has no closed form"
+        reason = (
+            f"no answer: the channel {uplink.model} {why_no_chain(uplink)}, so that its loss rate has no closed form"
+        )
         return Margin(name, label, None, reason=reason, extra={"loss_rate": None})
     rate = chain.loss_rate
     extra, label = {"loss_rate": rate}, f"{label} at a loss rate of {rate:.4g}"

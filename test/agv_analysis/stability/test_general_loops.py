@@ -221,6 +221,12 @@ def maps_of(loop: LinearLoop, k: int) -> tuple[Floats, Floats]:
     return received, missed
 
 
+def repeating(outcomes: str) -> Chain:
+    """The channel whose slots are received, "R", and lost, "L", in this order, again and again."""
+    delivery = np.array([float(slot == "R") for slot in outcomes])
+    return Chain(np.roll(np.eye(len(outcomes)), 1, axis=1), delivery)
+
+
 def dense_growth(loop: LinearLoop, p: float, steps: int) -> float:
     """Growth (logarithm) of the second moments under independent losses, by the product of the recursions."""
     product = np.eye((loop.size + loop.outputs) ** 2)
@@ -245,12 +251,6 @@ def dense_step(loop: LinearLoop, k: int, chain: Chain) -> Floats:
     return np.block([[chain.transition[i, j] * blocks[i] for i in states] for j in states])
 
 
-def repeating(outcomes: str) -> Chain:
-    """The channel whose slots are received, "R", and lost, "L", in this order, again and again."""
-    delivery = np.array([float(slot == "R") for slot in outcomes])
-    return Chain(np.roll(np.eye(len(outcomes)), 1, axis=1), delivery)
-
-
 CYCLES = ["R", "RL", "RLL", "RRLLRL", "RLLLLLL"]
 
 
@@ -266,7 +266,7 @@ def test_the_mean_square_under_outcomes_that_repeat_by_its_dense_recursion(kind:
     assert mean_square.lap_growth(loop, chain) == pytest.approx(truth, abs=1e-6 if "L" in outcomes else 1e-3)
 
 
-@pytest.mark.parametrize("chain", [bernoulli(0.6), gilbert_elliott(0.1, 0.3, 0.2, 0.9)])
+@pytest.mark.parametrize("chain", [bernoulli(0.6), gilbert_elliott(0.1, 0.3, 0.2, 0.9), repeating("RLLRLL")])
 @OF_LAGGED
 def test_the_mean_square_of_a_loop_that_stays_as_it_is(loop: LinearLoop, chain: Chain) -> None:
     """By the dense recursion, and by driving the same loop as a lap of many equal steps."""

@@ -104,6 +104,14 @@ def test_outages_by_the_clock_are_no_gilbert_channel() -> None:
     assert found.to_json()["stationarity"] is not None
 
 
+@pytest.mark.parametrize(("n", "is_stable"), [(10, True), *((n, False) for n in (16, 200, 999, 20_000, 10**6))])
+def test_outages_that_repeat_are_judged_by_their_own_length_however_long_they_are(n: int, is_stable: bool) -> None:
+    """Along the line an outage of n slots multiplies the error by 1 - (n + 1) / 8; at n = 15 by -1."""
+    settings = (LINE, "relay.uplink.model=burst", f"relay.uplink.n={n}")
+    found = decide(evidence_of_scenario(scenario_of(*settings), with_margin=False))
+    assert (found.word in GREEN) == is_stable
+
+
 def test_a_run_that_ends_in_an_outage_is_not_judged_as_if_it_never_ended() -> None:
     run = simulate(scenario_of(*BERNOULLI, "relay.uplink.p=0.0", "plant.duration=10.0"))
     lost = np.zeros(len(run), dtype=np.bool_)
