@@ -15,7 +15,7 @@ from agv_plant.parameters import PlantParameters, RelayParameters
 from agv_plant.vehicle.registry import VEHICLES
 from agv_ros.parameters import ParameterError, as_dict
 from agv_ros.params_file import parse_sections, read_sections, resolve
-from agv_ros.parts import Registry
+from agv_ros.part_registry import Registry
 from agv_ros.ros_yaml import dump
 from agv_ros.stamps import Grid
 

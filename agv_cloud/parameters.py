@@ -13,7 +13,8 @@ from agv_cloud.staleness.registry import STALENESS_POLICIES, number_of
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES
 from agv_ros.parameters import LoopParameters, ParameterError, merged, parameter, parameters_of
-from agv_ros.parts import field_of, refuse_taken, schema_of, try_part, values_of
+from agv_ros.part_parameters import field_of, refuse_taken, schema_of, values_of
+from agv_ros.parts import try_part
 from agv_ros.pose import Pose
 
 TRIGGERS = ("slot", "timer")

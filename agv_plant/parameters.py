@@ -20,7 +20,8 @@ from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
 from agv_plant.vehicle.unicycle import STEPS
 from agv_ros.message_types import COMMAND_TYPES, POSE_TYPES, TWIST
 from agv_ros.parameters import LoopParameters, ParameterError, TwoDomains, group, merged, parameter, parameters_of
-from agv_ros.parts import refuse_taken, schema_of, try_part, values_of
+from agv_ros.part_parameters import refuse_taken, schema_of, values_of
+from agv_ros.parts import try_part
 
 
 @dataclass(frozen=True)

@@ -17,25 +17,18 @@ disturbs nobody until it is chosen.
 
 from __future__ import annotations
 
-import functools
-import importlib
 import inspect
 import keyword
 import math
-import pkgutil
 import re
 import types
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass
-from importlib.metadata import EntryPoint, entry_points
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
-from agv_ros.parameters import Parameter, ParameterError, forget_parameters, group, parameter
+from agv_ros.parameters import Parameter, ParameterError
 from agv_ros.substitution import Function
-
-OWN = "agv_ncs"
-"""Source of this package's parts."""
 
 IN_RANGE = 1e100
 """A number of at least this size belongs to a loop that diverges; what a part makes of it is not held against it."""
@@ -134,153 +127,6 @@ class Part:
         return tuple(parameter.default for parameter in self.parameters)
 
 
-@dataclass(frozen=True)
-class Functions:
-    """Functions of one kind by name: those of this package, and those that other packages announce."""
-
-    kind: str
-    """What such a function is called in messages: `control law`."""
-    group: str
-    """Group of entry points by which other packages announce theirs."""
-    own: Mapping[str, Function]
-    """Those of this package."""
-    reserved: tuple[str, ...] = ()
-    """Names of this package that stand for something else than a function."""
-    _registered: dict[str, tuple[str, Function]] = field(default_factory=dict, compare=False)
-    """Functions of this process alone, each after what it is called in messages."""
-
-    def names(self) -> tuple[str, ...]:
-        """All names: those of this package, of other installed ones, be they usable or not, and of this process."""
-        return tuple(dict.fromkeys((*self.own, *self.reserved, *installed(self.group), *self._registered)))
-
-    def register(self, name: str, function: Function) -> None:
-        """Add a function for this process alone, or put another one in the place of one that was added so.
-
-        Raises PartError for a name that is taken, or if it is no function.
-        """
-        self._registered[name] = self._named(name, function)
-        forget_parameters()
-
-    def _named(self, name: str, function: Function) -> tuple[str, Function]:
-        """What a function that is registered is called in messages, and the function itself."""
-        if name in self.names() and name not in self._registered:
-            raise PartError(f"there is a {self.kind} {name} already: choose another name")
-        function = getattr(function, "py_func", function)  # one that its author has compiled with numba
-        if not isinstance(function, types.FunctionType):
-            raise PartError(f"{self.kind} {name} must be a function, found {_short(function)}")
-        return f"{self.kind} {name} (registered by {function.__module__})", function
-
-    @property
-    def remedy(self) -> str:
-        """What to do where a name is none of `names`."""
-        return f"if another package has this {self.kind}, install it (its entry point is in the group {self.group})"
-
-    def load(self, name: str) -> tuple[str, Function]:
-        """What the function called `name` is called in messages, and the function itself.
-
-        Raises PartError if there is none, if two have this name, or if it cannot be loaded.
-        """
-        if name in self._registered:
-            return self._registered[name]
-        points = installed(self.group).get(name, ())
-        known = name in self.own or name in self.reserved
-        sources = [*(["that of agv_ncs"] if known else []), *(f"{point.value} of another package" for point in points)]
-        if not sources:
-            raise PartError(
-                f"there is no {self.kind} {name!r}, must be one of {', '.join(self.names())}: {self.remedy}"
-            )
-        if len(sources) > 1:
-            raise PartError(f"two {self.kind}s are called {name}: {' and '.join(sources)}; rename one")
-        if name in self.own:
-            return f"{self.kind} {name}", self.own[name]
-        where = f"{self.kind} {name} ({points[0].value})"
-        try:
-            function = points[0].load()
-        except (Exception, SystemExit) as error:  # another package's code, in which anything can go wrong
-            reason = " ".join(str(error).split()) if isinstance(error, (ImportError, AttributeError)) else _line(error)
-            raise PartError(f"{where} cannot be loaded: {reason}") from error
-        function = getattr(function, "py_func", function)  # one that its author has compiled with numba
-        if not callable(function):
-            raise PartError(f"{where} must be a function, found {_short(function)}")
-        return where, function
-
-
-@dataclass(frozen=True)
-class Registry(Functions):
-    """The parts of one kind by name."""
-
-    call: Call = Call("", (), "", (), "", "", ())
-    _found: dict[str, Part] = field(default_factory=dict, compare=False)
-
-    def register(self, name: str, function: Function) -> None:
-        """Add a part for this process alone, or put another one with the same parameters in its place.
-
-        Raises PartError as for functions, and if it cannot be called.
-        """
-        where, function = self._named(name, function)
-        part, before = part_of(name, where, function, self.call), self._found.get(name)
-        names = [known.name for known in part.parameters]
-        if before is not None and names != [known.name for known in before.parameters]:
-            raise PartError(
-                f"{where}: its parameters are {', '.join(names) or 'none'}, but scenarios may hold values of "
-                f"{', '.join(known.name for known in before.parameters) or 'none'}, with which it was registered "
-                "before: choose another name"
-            )
-        self._found[name] = part
-        super().register(name, function)
-
-    def find(self, name: str) -> Part:
-        """The part called `name`. Raises PartError as `load` does, and if it cannot be called."""
-        if name not in self._found:
-            where, function = self.load(name)
-            self._found[name] = part_of(name, where, function, self.call)
-        return self._found[name]
-
-    def own_part(self, name: str) -> Part:
-        """A part of this package, whatever other packages call theirs."""
-        return part_of(name, f"{self.kind} {name}", self.own[name], self.call)
-
-    def usable(self) -> dict[str, Part]:
-        """All parts that can be loaded; the others are refused when they are chosen."""
-        return {name: self.find(name) for name in self.names() if not self.refusal(name)}
-
-    def refusal(self, name: str) -> str:
-        """Why the part called `name` cannot be used; empty if it can, or if there is none."""
-        if name in self.names():
-            try:
-                self.find(name)
-            except PartError as error:
-                return str(error)
-        return ""
-
-
-def own_parts(package: str, first: str, besides: Collection[str], name: str = "") -> dict[str, Function]:
-    """The functions of this package's parts by name, found in the modules of a folder, so that a new one is one file.
-
-    That of a module is the one called as the module is, or `name`; `besides` are the modules that hold none. They are
-    in the order of the alphabet after the `first`, which is the default.
-    """
-    folder = importlib.import_module(package)
-    found: dict[str, Function] = {}
-    modules = (known.name for known in pkgutil.iter_modules(folder.__path__))
-    for module in sorted(modules, key=lambda module: (module != first, module)):
-        if module not in besides:
-            function = getattr(importlib.import_module(f"{package}.{module}"), name or module, None)
-            if not isinstance(function, types.FunctionType):
-                raise PartError(f"{package}.{module} has no function {name or module}, and is not said to hold none")
-            found[module] = function
-    return found
-
-
-@functools.cache
-def installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
-    """Entry points of a group by name; more than one where packages chose the same name."""
-    found: dict[str, tuple[EntryPoint, ...]] = {}
-    for point in sorted(set(entry_points(group=group)), key=lambda point: (point.name, point.value)):
-        found[point.name] = (*found.get(point.name, ()), point)
-    return found
-
-
 # -- from a function to a part -----------------------------------------------------------------------------------------
 
 
@@ -289,7 +135,7 @@ def part_of(name: str, where: str, function: Function, call: Call) -> Part:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or keyword.iskeyword(name):
         raise PartError(f"{where}: its name must be letters, digits and _, as its parameters are called {name}.gain")
     if not isinstance(function, types.FunctionType):
-        raise PartError(f"{where} must be a function, found {_short(function)}")
+        raise PartError(f"{where} must be a function, found {shortened(function)}")
     signature = inspect.signature(function)
     names = list(signature.parameters)
     for argument in signature.parameters.values():
@@ -327,7 +173,7 @@ def _initial_memory(argument: inspect.Parameter, where: str) -> tuple[float, ...
     begin = argument.default
     numbers = isinstance(begin, tuple) and all(isinstance(x, (int, float)) and math.isfinite(x) for x in begin)
     if not numbers or not begin:
-        found = "no default" if begin is argument.empty else _short(begin)
+        found = "no default" if begin is argument.empty else shortened(begin)
         raise PartError(f"{where}: memory must have a tuple of numbers as default, which it begins with, got {found}")
     return tuple(map(float, begin))
 
@@ -340,7 +186,9 @@ def _hint_of(argument: inspect.Parameter, function: Function, where: str) -> Any
     try:
         return get_type_hints(alone, function.__globals__, include_extras=True)[argument.name]
     except Exception as error:  # an annotation that does not evaluate can raise anything
-        raise PartError(f"{where}: the type of its parameter {argument.name} cannot be read: {_line(error)}") from error
+        raise PartError(
+            f"{where}: the type of its parameter {argument.name} cannot be read: {in_one_line(error)}"
+        ) from error
 
 
 def _parameter_of(argument: inspect.Parameter, hint: Any, where: str, runtime: bool) -> tuple[Parameter, bool]:
@@ -353,7 +201,7 @@ def _parameter_of(argument: inspect.Parameter, hint: Any, where: str, runtime: b
     if type(default) is int:
         raise PartError(f"{where}: its parameter {argument.name} must be a float, got {default}: write {default}.0")
     if not isinstance(default, float) or hint not in (None, float):
-        raise PartError(f"{where}: its parameter {argument.name} must be a float, got {_short(argument)}")
+        raise PartError(f"{where}: its parameter {argument.name} must be a float, got {shortened(argument)}")
     high = math.inf if known.high is None and math.isinf(default) else known.high
     found = Parameter(
         argument.name, "double", float(default), known.unit, known.description or f"parameter of {where}",
@@ -419,11 +267,11 @@ def try_part(part: Part, call: Call, *arguments: Any) -> None:
         raise PartError(f"{part.where} {complaint(error)}") from error
     words = [call.words, *part.states, *([f"its memory, {len(part.memory)} of them"] if part.memory else [])]
     if _shape(found) != _expected_shape(part, call):
-        raise PartError(f"{part.where} must return numbers, a tuple of {', '.join(words)}; got {_short(found)}")
+        raise PartError(f"{part.where} must return numbers, a tuple of {', '.join(words)}; got {shortened(found)}")
     if not all(math.isfinite(x) for x in _flat(found)):
         named = dict(zip(call.arguments.split(", "), arguments, strict=True))
-        given = ", ".join(f"{name} = {_short(named[name])}" for name in call.required)
-        raise PartError(f"{part.where} must return finite numbers, got {_short(found)} for {given}")
+        given = ", ".join(f"{name} = {shortened(named[name])}" for name in call.required)
+        raise PartError(f"{part.where} must return finite numbers, got {shortened(found)} for {given}")
 
 
 def _shape(found: Any) -> Any:
@@ -448,7 +296,7 @@ def _flat(found: Any) -> Any:
 
 def complaint(error: BaseException) -> str:
     """What a part did, as the end of a sentence that begins with its name."""
-    return str(error) if isinstance(error, NotANumberError) else f"raises {_line(error)}"
+    return str(error) if isinstance(error, NotANumberError) else f"raises {in_one_line(error)}"
 
 
 def culprit(error: BaseException) -> str:
@@ -460,78 +308,12 @@ def culprit(error: BaseException) -> str:
     return found
 
 
-def _line(error: BaseException) -> str:
+def in_one_line(error: BaseException) -> str:
     """An error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _short(value: object) -> str:
+def shortened(value: object) -> str:
     """A value for a message."""
     text = str(value) if isinstance(value, inspect.Parameter) else repr(value)
     return text if len(text) <= _LONGEST_VALUE else text[:_LONGEST_VALUE] + " ..."
-
-
-# -- their parameters --------------------------------------------------------------------------------------------------
-
-_OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides")
-"""Parameters that a node has without declaring them."""
-
-
-def refuse_taken(part: Part, taken: Sequence[str]) -> None:
-    """Raise PartError for a part that is called as a parameter of its node, and so would be its group of parameters."""
-    if part.parameters and part.name in (*taken, *_OF_ROS):
-        raise PartError(f"{part.where}: its node has a parameter {part.name}, so none can be called so: rename it")
-
-
-def schema_of(class_name: str, parts: Mapping[str, Part], taken: Sequence[str], module: dict[str, Any]) -> type:
-    """A schema with a group of parameters for each part that has some: names `part.parameter`.
-
-    Parts whose names are `taken` by parameters of the node are left out. The classes are put into the `module` given by
-    its globals, where other processes find them; as long as the parts are the same ones, so is the class.
-    """
-    if class_name in module and module[class_name].of_parts == parts:
-        return module[class_name]  # type: ignore[no-any-return]
-    fields: list[tuple[str, type, Any]] = []
-    for part in parts.values():
-        if part.parameters and part.name not in (*taken, *_OF_ROS):
-            own = _dataclass(
-                f"{class_name}_{part.name}", [(p.name, float, _field_of(p)) for p in part.parameters], module
-            )
-            fields.append((part.name, own, group(own)))
-    made = _dataclass(class_name, fields, module)
-    made.of_parts = dict(parts)  # type: ignore[attr-defined]
-    return made
-
-
-def _dataclass(name: str, fields: list[tuple[str, type, Any]], module: dict[str, Any]) -> type:
-    made = make_dataclass(name, fields, frozen=True, namespace={"__module__": module["__name__"]})
-    module[name] = made
-    return made
-
-
-def values_of(part: Part, groups: object) -> tuple[float, ...]:
-    """The values of a part's parameters in an instance of `schema_of`, in the order of its signature.
-
-    Raises PartError for a part that was not there yet when the schema was made.
-    """
-    if not part.parameters:
-        return ()
-    own = getattr(groups, part.name, None)
-    if own is None:
-        raise PartError(
-            f"{part.where} could not be loaded when its parameters were declared: let its module import nothing of "
-            "agv_ncs but agv_ros.parts; or it was registered after its node's parameters were made: make them anew"
-        )
-    return tuple(getattr(own, known.name) for known in part.parameters)
-
-
-def _field_of(known: Parameter) -> Any:
-    return parameter(
-        known.default, known.description, unit=known.unit, low=known.low, high=known.high, above=known.above,
-        runtime=known.runtime,
-    )  # fmt: skip
-
-
-def field_of(part: Part, name: str) -> Any:
-    """Dataclass field for one parameter of a part, as `parameter` makes it."""
-    return _field_of(next(known for known in part.parameters if known.name == name))

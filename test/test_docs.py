@@ -16,7 +16,7 @@ import pytest
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.vehicle.registry import VEHICLES
-from agv_ros.parts import Registry
+from agv_ros.part_registry import Registry
 
 REPOSITORY = Path(__file__).parents[1]
 

@@ -9,7 +9,8 @@ gains.
 
 from __future__ import annotations
 
-from agv_ros.parts import Call, Registry, own_parts
+from agv_ros.part_registry import Registry, own_parts
+from agv_ros.parts import Call
 
 KANAYAMA = "kanayama"
 """The paper's law, whose gains are parameters of the controller without a name before them."""

@@ -10,7 +10,8 @@ If it names them it also gets the command v [m/s], w [rad/s] that was sent in th
 
 from __future__ import annotations
 
-from agv_ros.parts import Call, Registry, own_parts
+from agv_ros.part_registry import Registry, own_parts
+from agv_ros.parts import Call
 from agv_ros.pose import Pose
 
 STALENESS_POLICIES = Registry(

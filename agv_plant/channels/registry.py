@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from agv_plant.channels.model import Model
 from agv_plant.channels.position_dependent import PLACED
-from agv_ros.parts import Functions, PartError, own_parts
+from agv_ros.part_registry import Functions, own_parts
+from agv_ros.parts import PartError
 
 GROUP = "agv_ncs.channels"
 

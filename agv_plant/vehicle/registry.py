@@ -9,7 +9,8 @@ how its axes are turned.
 
 from __future__ import annotations
 
-from agv_ros.parts import Call, Registry, own_parts
+from agv_ros.part_registry import Registry, own_parts
+from agv_ros.parts import Call
 
 UNICYCLE = "unicycle"
 """The paper's vehicle."""

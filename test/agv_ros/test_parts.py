@@ -4,30 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from importlib.metadata import EntryPoint
 from typing import Annotated, Any
 
 import pytest
 
 from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
-from agv_plant.channels.registry import CHANNELS
 from agv_plant.vehicle.registry import VEHICLES
-from agv_ros import parts
-from agv_ros.parameters import parameters_of
-from agv_ros.parts import (
-    Functions,
-    NotANumberError,
-    PartError,
-    Quantity,
-    Registry,
-    culprit,
-    part_of,
-    refuse_taken,
-    schema_of,
-    try_part,
-    values_of,
-)
+from agv_ros.parts import NotANumberError, PartError, Quantity, culprit, part_of, try_part
 from agv_ros.pose import Pose
 
 LAW, VEHICLE, POLICY = CONTROL_LAWS.call, VEHICLES.call, STALENESS_POLICIES.call
@@ -202,80 +186,3 @@ def test_an_adapter_refuses_nan_unless_the_loop_has_diverged() -> None:
     assert culprit(caught.value) == "mine (a:b)"
     assert math.isnan(found.adapter(1e200, 0.0, 0.0, 0.0, 0.0, (), (), 0.1, 0.0)[1])
     assert culprit(ValueError("from elsewhere")) == ""
-
-
-# -- registries --------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def others(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Registry]:
-    """A registry of laws with entry points `name=value` of other packages."""
-
-    def registry(*points: str) -> Registry:
-        found: dict[str, tuple[EntryPoint, ...]] = {}
-        for name, value in (point.split("=") for point in points):
-            found[name] = (*found.get(name, ()), EntryPoint(name, value, "a_group"))
-        monkeypatch.setattr(parts, "installed", lambda group: found)
-        return Registry(kind="control law", group="a_group", own={"kanayama": law}, call=LAW)
-
-    return registry
-
-
-def test_names_of_this_package_come_first_and_those_of_others_after_them(others: Callable[..., Registry]) -> None:
-    found = others("mine=elsewhere:mine", "kanayama=elsewhere:kanayama")
-    assert found.names() == ("kanayama", "mine")
-    assert found.own_part("kanayama").function is law
-
-
-@pytest.mark.parametrize(
-    ("points", "name", "said"),
-    [
-        (
-            (),
-            "none",
-            "there is no control law 'none', must be one of kanayama: if another package has this control law",
-        ),
-        (("mine=no_such:law",), "mine", "control law mine (no_such:law) cannot be loaded: No module named 'no_such'"),
-        (("mine=math:no_such",), "mine", "control law mine (math:no_such) cannot be loaded: module 'math' has no"),
-        (("mine=math:pi",), "mine", "control law mine (math:pi) must be a function, found 3.14"),
-        (("mine=a:b", "mine=c:d"), "mine", "two control laws are called mine: a:b of another package and c:d of"),
-        (("kanayama=a:b",), "kanayama", "two control laws are called kanayama: that of agv_ncs and a:b of another"),
-    ],
-)
-def test_what_cannot_be_found_is_one_line_and_disturbs_no_other(
-    others: Callable[..., Registry], points: tuple[str, ...], name: str, said: str
-) -> None:
-    found = others(*points)
-    with pytest.raises(PartError) as caught:
-        found.find(name)
-    assert said in str(caught.value)
-    if points:
-        assert found.refusal(name) == str(caught.value)
-    assert found.refusal("nobody") == ""
-    assert name not in found.usable()
-
-
-def test_every_kind_has_a_group_of_its_own() -> None:
-    kinds: tuple[Functions, ...] = (CONTROL_LAWS, VEHICLES, STALENESS_POLICIES, CHANNELS)
-    assert [kind.group for kind in kinds] == [
-        "agv_ncs.control_laws", "agv_ncs.vehicles", "agv_ncs.staleness_policies", "agv_ncs.channels",
-    ]  # fmt: skip
-    for registry in (CONTROL_LAWS, VEHICLES, STALENESS_POLICIES):
-        assert set(registry.own) <= set(registry.usable())
-
-
-# -- parameters --------------------------------------------------------------------------------------------------------
-
-
-def test_parameters_of_parts_are_groups_and_those_that_would_be_called_as_others_are_left_out() -> None:
-    found = {name: part_of(name, f"control law {name}", law, LAW) for name in ("mine", "ts", "use_sim_time")}
-    module: dict[str, Any] = {"__name__": __name__}
-    schema = schema_of("Laws", found, ("ts",), module)
-    assert list(parameters_of(schema)) == ["mine.k", "mine.w_max"]
-    assert values_of(found["mine"], schema()) == (2.0, math.inf)
-    refuse_taken(found["mine"], ("ts",))
-    for taken in ("ts", "use_sim_time"):
-        with pytest.raises(PartError, match=f"control law {taken}: its node has a parameter {taken}"):
-            refuse_taken(found[taken], ("ts",))
-    with pytest.raises(PartError, match="could not be loaded when its parameters were declared"):
-        values_of(found["ts"], schema())
