@@ -16,15 +16,16 @@ from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.json_table import JsonTable
-from agv_analysis.bags.known_types import Definition, KnownTypes, is_undefined
+from agv_analysis.bags.known_types import UNDEFINED, Definition, KnownTypes, is_undefined
 from agv_analysis.bags.layout import LOG_TIME
-from agv_analysis.bags.message_batch import NO_DEFINITION, Batch
+from agv_analysis.bags.message_batch import Batch
 from agv_analysis.bags.message_compression import inflated_batches
 from agv_analysis.bags.message_table import Table
 from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import Contents, locate, open_files
-from agv_analysis.bags.schema import Struct, parse_schema, short_name
+from agv_analysis.bags.schema import short_name
 from agv_analysis.bags.storage import Storage, is_large
+from agv_analysis.bags.topic_types import TopicTypes
 from agv_analysis.bags.type_hash import contradicts
 
 _THREADS = 2
@@ -143,7 +144,7 @@ def read_bag(
     """
     path = Path(path)
     contents = locate(path)
-    types = KnownTypes(None if definitions is None else Path(definitions))
+    types = TopicTypes(contents, KnownTypes(None if definitions is None else Path(definitions)))
     with ThreadPoolExecutor(1, "pages") as helper:
         reading = _Reading(topics, helper, contents, types)
         for number, storage in enumerate(open_files(contents)):
@@ -159,7 +160,7 @@ def read_bag(
 class _Reading:
     """What has been read so far, over all files of a bag."""
 
-    def __init__(self, topics: Collection[str] | None, helper: Executor, contents: Contents, types: KnownTypes) -> None:
+    def __init__(self, topics: Collection[str] | None, helper: Executor, contents: Contents, types: TopicTypes) -> None:
         self._helper = helper
         self._contents = contents
         self._types = types
@@ -167,8 +168,8 @@ class _Reading:
         self._findings = Findings()
         self._known: dict[str, tuple[Channel, Schema | None]] = {}
         self._borrowed: dict[str, Definition] = {}
-        self._first: dict[str, Schema] = {}
-        self._forms: dict[tuple[str, str, bytes], Struct] = {}
+        self._first: dict[str, Definition] = {}
+        self._silent: dict[str, tuple[Storage, Channel]] = {}
         self._tables: dict[str, Table | JsonTable] = {}
         self._refusals: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
@@ -204,7 +205,7 @@ class _Reading:
             self._counts[channel.topic] += storage.counts[number]
             self._known.setdefault(channel.topic, (channel, storage.schemas.get(channel.schema_id)))
             if self.is_wanted(channel):
-                self._table(storage, channel, None)
+                self._silent.setdefault(channel.topic, (storage, channel))
         self._metadata.update(storage.metadata)
         self._distro = self._distro or storage.distro or self._contents.distro
         self._attachments += [
@@ -216,8 +217,7 @@ class _Reading:
     def _table(self, storage: Storage, channel: Channel, batch: Batch | None) -> Table | JsonTable | None:
         """The table of a channel's topic, None if its messages cannot be decoded; `batch`: some of them."""
         topic = channel.topic
-        schema = storage.schemas.get(channel.schema_id) or self._by_metadata(topic)
-        self._known.setdefault(topic, (channel, schema))
+        self._known.setdefault(topic, (channel, self._types.named(storage, channel)))
         if topic in self._refusals or (batch is None and topic in self._tables):
             return self._tables.get(topic)
         try:
@@ -225,46 +225,27 @@ class _Reading:
                 return self._tables.setdefault(topic, JsonTable())
             if channel.encoding != "cdr":
                 raise UndecodableError(f"its messages are encoded as {channel.encoding!r}; cdr and json are read")
-            if schema is None:
-                raise UndecodableError(NO_DEFINITION)
-            definition = self._define(storage, channel, schema, batch)
-            form = self._form(definition.schema)
-            first = self._first.setdefault(topic, definition.schema)
-            if short_name(first.name) != short_name(schema.name) or self._form(first) != form:
-                raise UndecodableError(f"it has messages of two types, {first.name} and {schema.name}")
+            if batch is None:
+                definition = self._types.without_messages(storage, channel)
+            else:
+                definition = self._types.define(storage, channel, batch)
+            if definition.is_worth_a_note:
+                self._borrowed[topic] = definition
+            first = self._first.setdefault(topic, definition)
+            if first.form != definition.form or short_name(first.schema.name) != short_name(definition.schema.name):
+                one, other = first.schema.name, definition.schema.name
+                raise UndecodableError(f"it has messages of two types, {one} and {other}")
             if topic not in self._tables:
                 self._known[topic] = channel, definition.schema
-                if contradicts(schema.name, definition.schema.text, channel.metadata.get(TYPE_HASH, "")):
+                schema = definition.schema
+                if contradicts(schema.name, schema.text, channel.metadata.get(TYPE_HASH, "")):
                     what = "definition of its type that does not match the recorded hash, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
                 helper = self._helper if is_large(storage.size) else None
-                self._tables[topic] = Table(form, storage.expected(channel.id), helper)
+                self._tables[topic] = Table(definition.form, storage.expected(channel.id), helper)
         except UndecodableError as error:
             self._refuse(topic, error)
         return self._tables.get(topic)
-
-    def _by_metadata(self, topic: str) -> Schema | None:
-        """What metadata.yaml knows of a topic's type: its name."""
-        kind = self._contents.types.get(topic)
-        return Schema(0, kind, "", b"") if kind else None
-
-    def _define(self, storage: Storage, channel: Channel, schema: Schema, batch: Batch | None) -> Definition:
-        """The definition of a channel's type, from wherever there is one."""
-        message = None
-        if batch is not None and len(batch):
-            begin = int(batch.starts[0])
-            message = batch.buffer[begin : begin + int(batch.sizes[0])].tobytes()
-        distro = storage.distro or self._contents.distro
-        found = self._types.define(schema, distro, channel.metadata.get(TYPE_HASH, ""), message)
-        if found.source:
-            self._borrowed[channel.topic] = found
-        return found
-
-    def _form(self, schema: Schema) -> Struct:
-        key = (schema.name, schema.encoding, schema.data)
-        if key not in self._forms:
-            self._forms[key] = parse_schema(schema.name, schema.encoding, schema.text)
-        return self._forms[key]
 
     def _refuse(self, topic: str, error: UndecodableError) -> None:
         self._refusals[topic] = f"cannot be decoded: {error}"
@@ -273,8 +254,19 @@ class _Reading:
             self._undecoded.setdefault(topic, []).append(table.rows[LOG_TIME].copy())
         self._latest.clear()
 
+    def _doubt(self, topic: str, table: Table | JsonTable) -> None:
+        """Give up a definition from elsewhere that does not describe most messages of a topic."""
+        found = self._counts[topic]
+        if isinstance(table, Table) and found and 2 * table.misfits >= found:
+            about = f"that of {self._borrowed[topic].source} does not describe {table.misfits} of its {found} messages"
+            self._refuse(topic, UndecodableError(f"{UNDEFINED}, and {about}"))
+
     def bag(self, path: Path) -> Bag:
         """The bag, once all files have been read."""
+        for storage, channel in self._silent.values():
+            self._table(storage, channel, None)
+        for topic in self._borrowed.keys() & self._tables.keys():
+            self._doubt(topic, self._tables[topic])
         arrays: dict[str, NDArray[np.void]] = {}
         for topic, table in sorted(self._tables.items()):
             try:

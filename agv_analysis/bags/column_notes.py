@@ -11,7 +11,15 @@ from typing import NamedTuple
 
 from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME
-from agv_analysis.bags.schema import PRIMITIVES, STRING, definitions_by_name, parse_line, resolve_type, short_name
+from agv_analysis.bags.schema import (
+    PRIMITIVES,
+    STRING,
+    WSTRING,
+    definitions_by_name,
+    parse_line,
+    resolve_type,
+    short_name,
+)
 
 _MAX_DEPTH = 32
 
@@ -91,7 +99,7 @@ def _describe(
             notes[path] = Note(unit, meaning)
             if member.is_sequence:
                 notes[f"len({path})"] = Note("1", f"number of elements of {path}")
-            if inner not in PRIMITIVES and inner != STRING and depth < _MAX_DEPTH:
+            if inner not in (*PRIMITIVES, STRING, WSTRING) and depth < _MAX_DEPTH:
                 _describe(texts, resolve_type(texts, inner, kind), f"{path}.", unit, notes, depth + 1)
         comments = []
 

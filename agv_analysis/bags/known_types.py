@@ -2,8 +2,7 @@
 
 Bags in sqlite3 have none before Iron, and a recorder that does not find a definition leaves it empty. Types of the
 distributions have changed over the years, so which one is meant decides, in this order, the recorded hash of the type,
-the distribution that the bag names, and which of the definitions describes a message to its last byte. If that leaves
-more than one, the topic is not decoded: a number that may be wrong is worse than none.
+the distribution that the bag names, and which of the definitions describes the messages (`topic_types`).
 """
 
 from __future__ import annotations
@@ -16,15 +15,21 @@ from typing import Any, NamedTuple
 
 from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.idl import definitions_in_idl
-from agv_analysis.bags.layout import trace
 from agv_analysis.bags.message_batch import NO_DEFINITION
 from agv_analysis.bags.message_definitions import assemble, installed_definition
 from agv_analysis.bags.records import Schema
-from agv_analysis.bags.schema import MissingTypeError, definitions_by_name, parse_schema, short_name
+from agv_analysis.bags.schema import (
+    WIDTHS,
+    MissingTypeError,
+    Struct,
+    definitions_by_name,
+    parse_schema,
+    short_name,
+)
 from agv_ros.errors import UserError
 
-_UNDEFINED = "the bag does not hold the definition of its type"
-_WITHOUT_ROSBAGS = f"{_UNDEFINED}; those of ROS 2 come with rosbags: `pip install rosbags`"
+UNDEFINED = "the bag does not hold the definition of its type"
+_WITHOUT_ROSBAGS = f"{UNDEFINED}; those of ROS 2 come with rosbags: `pip install rosbags`"
 
 _ENDINGS = (".msg", ".idl", ".srv")
 _EVENT = "_Event"
@@ -35,8 +40,22 @@ class Definition(NamedTuple):
 
     schema: Schema
     source: str
-    """As in "ROS 2 humble"; empty if the bag holds it."""
+    """As in "ROS 2 humble"; empty if it is the bag's own."""
     gap: str = "is not in the bag, that of"
+    width: int = WIDTHS[0]
+    """Bytes of a character of its wstrings."""
+    is_guess: bool = False
+    """Is it merely possible that the type has no members, since the bag defines it by nothing?"""
+
+    @property
+    def form(self) -> Struct:
+        """Members of the type. Raises UndecodableError."""
+        return _parsed(self.schema.name, self.schema.encoding, self.schema.data, self.width)
+
+    @property
+    def is_worth_a_note(self) -> bool:
+        """Could it be a wrong one? That a type has no members needs no definition."""
+        return self.source != "" and not self.form.is_empty
 
     @property
     def note(self) -> str:
@@ -74,32 +93,30 @@ class KnownTypes:
         if not self._files:
             raise BagError(f"{folder}: no definitions: there is no .msg, .idl or .srv file in it or in its folders")
 
-    def define(self, schema: Schema, distro: str, type_hash: str, message: bytes | None) -> Definition:
-        """The definition of a type: the bag's own `schema`, or, if that is empty, one from elsewhere.
+    def candidates(self, schema: Schema, distro: str, type_hash: str) -> list[Definition]:
+        """Definitions that a type may have: the bag's own `schema`, or, if that is empty, those from elsewhere.
 
-        Types that the bag's own uses without describing them are taken from elsewhere, too. `distro`, `type_hash`: what
-        the bag says, or empty; `message`: one of the type, behind its lead.
-        Raises UndecodableError if no definition is known, or more than one and nothing says which.
+        Types that the bag's own uses without describing them are taken from elsewhere, too. Of several that mean the
+        same there is one, the newest. `distro`, `type_hash`: what the bag says, or empty.
+        Raises UndecodableError if no definition is known, or none is understood.
         """
         if not is_undefined(schema):
-            return self._completed(schema, distro)
-        candidates = self._candidates(schema.name, distro, type_hash)
-        fitting = [known for known in candidates if _fits(schema.name, known, message)]
-        if candidates and not fitting:
-            sources = ", ".join(known.source for known in candidates)
-            raise UndecodableError(f"{_UNDEFINED}, and that of {sources} does not describe its messages")
-        if not fitting:
-            if schema.encoding == "ros2msg" and _fits(schema.name, _Known("", "", ""), message):  # it has no members
-                return Definition(schema, "")
-            raise UndecodableError(NO_DEFINITION if importlib.util.find_spec("rosbags") else _WITHOUT_ROSBAGS)
-        by_form = {_form(schema.name, known.text): known for known in reversed(fitting)}
-        if len(by_form) > 1 and message is not None:
-            sources = ", ".join(known.source for known in fitting)
-            raise UndecodableError(f"{_UNDEFINED}, and there are several that describe its messages ({sources})")
-        chosen = next(iter(by_form.values()))
-        is_empty = _form(schema.name, chosen.text).is_empty
-        found = schema.defined_by("ros2msg", chosen.text.encode())
-        return Definition(found, "" if is_empty else chosen.source)
+            return _in_all_widths(self._completed(schema, distro))
+        found: dict[Struct, Definition] = {}
+        reason = no_definition()
+        for known in self._candidates(schema.name, distro, type_hash):
+            try:
+                for definition in _in_all_widths(
+                    Definition(schema.defined_by("ros2msg", known.text.encode()), known.source)
+                ):
+                    found.setdefault(definition.form, definition)
+            except UndecodableError as error:
+                reason = f"{UNDEFINED}, and that of {known.source} is not understood: {error}"
+        if not found and reason == no_definition() and schema.encoding == "ros2msg":
+            return [Definition(schema, "", is_guess=True)]
+        if not found:
+            raise UndecodableError(reason)
+        return list(found.values())
 
     def _candidates(self, kind: str, distro: str, type_hash: str) -> list[_Known]:
         if self._folder is not None and (text := self._of_folder(kind, distro)) is not None:
@@ -123,7 +140,7 @@ class KnownTypes:
         text = self._read(kind)
         if text is None:
             found = _of_distributions(kind, distro)
-            if len({_form(kind, known.text) for known in found}) > 1:
+            if len({parse_schema(kind, "ros2msg", known.text) for known in found}) > 1:
                 return None
             text = found[0].text.split("\n====")[0] if found else _installed(kind)
         return text
@@ -269,16 +286,20 @@ def _stores(distro: str) -> Iterator[tuple[str, Any]]:
         yield name, get_typestore(store)
 
 
-def _form(kind: str, text: str) -> Any:
-    return parse_schema(kind, "ros2msg", text)
+# -- forms ------------------------------------------------------------------------------------------------------------
 
 
-def _fits(kind: str, known: _Known, message: bytes | None) -> bool:
-    """Does a definition describe a message to its last byte? One that cannot be parsed does not."""
-    try:
-        form = _form(kind, known.text)
-        if message is not None:
-            trace(form, message)
-    except UndecodableError:
-        return False
-    return True
+def no_definition() -> str:
+    """Why a type without any definition is not decoded."""
+    return NO_DEFINITION if importlib.util.find_spec("rosbags") else _WITHOUT_ROSBAGS
+
+
+@functools.lru_cache(1024)
+def _parsed(name: str, encoding: str, data: bytes, width: int) -> Struct:
+    return parse_schema(name, encoding, Schema(0, name, encoding, data).text, width)
+
+
+def _in_all_widths(definition: Definition) -> list[Definition]:
+    """A definition, once for each width that its wstrings may have. Raises UndecodableError."""
+    has_wstrings = definition.form.has_wstrings
+    return [definition._replace(width=width) for width in (WIDTHS if has_wstrings else WIDTHS[:1])]

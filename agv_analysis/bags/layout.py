@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.bags.bag_errors import UndecodableError
-from agv_analysis.bags.schema import STRING, Member, Struct
+from agv_analysis.bags.schema import STRING, WSTRING, Member, Struct, is_wstring
 
 LEAD = 16
 """Bytes before a message: log time and publish time [ns], little-endian, as in MCAP's message records."""
@@ -48,6 +48,8 @@ class Leaf:
     """Where the values, or blocks, begin, counted from the lead's first byte."""
     indices: list[Index] = field(default_factory=list)
     """Their places in the column, one index for each array around them."""
+    is_text: bool = False
+    """Are the values of a block the characters of one string, UTF-16 or UTF-32?"""
 
 
 @dataclass
@@ -124,6 +126,8 @@ class _Trace:
                 self._strings(path, count, index)
             elif isinstance(member.element, Struct):
                 self._structs(member.element, f"{path}.", count or 0, index)
+            elif is_wstring(member.element):
+                self._wide_strings(path, int(member.element.removeprefix(WSTRING)), count, index)
             else:
                 self._numbers(path, member.element, count, index)
 
@@ -155,10 +159,10 @@ class _Trace:
         self.position = begin + size
         return BODY + begin
 
-    def _add(self, path: str, code: str, block: int | None, index: Index, offset: int) -> None:
+    def _add(self, path: str, code: str, block: int | None, index: Index, offset: int, is_text: bool = False) -> None:
         leaf = self.leaves.get((path, code, block))
         if leaf is None:
-            leaf = self.leaves[path, code, block] = Leaf(path, code, block)
+            leaf = self.leaves[path, code, block] = Leaf(path, code, block, is_text=is_text)
         leaf.offsets.append(offset)
         leaf.indices.append(index)
 
@@ -178,6 +182,16 @@ class _Trace:
                 self._add(path, "S1", None, place, word + (self.order == "<"))
             else:
                 self._add(path, f"S{length - 1}", None, place, begin)
+
+    def _wide_strings(self, path: str, width: int, count: int | None, index: Index) -> None:
+        """As Fast CDR writes them: the number of characters, these, no final zero."""
+        for place in [index] if count is None else ((*index, i) for i in range(count)):
+            length = self._word(path)
+            if length:
+                begin = self._take(path, width, width * length)
+                self._add(path, f"{self.order}u{width}", length, place, begin, is_text=True)
+            else:
+                self._add(path, "S1", None, place, BODY + self.position - 4)
 
     def _structs(self, kind: Struct, prefix: str, count: int, index: Index) -> None:
         if count > self._end - self.position:

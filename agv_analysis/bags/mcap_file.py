@@ -65,6 +65,7 @@ from agv_analysis.bags.records import (
     Attachment,
     Channel,
     Footer,
+    Foreign,
     Schema,
     Statistics,
     has_shape,
@@ -97,24 +98,20 @@ def _has_shape(record: Record, opcode: int) -> bool:
     return has_shape(opcode, len(content), lambda at, count: content[at : at + count])
 
 
-def _unknown(opcode: int) -> str:
-    """What is said of a record of a kind that is not known here."""
-    kind = "private" if opcode >= PRIVATE else "unknown"
-    return f"record of the {kind} kind {opcode}, passed over"
-
-
 class McapFile:
     """Reads one MCAP file. Everything but the batches is complete only after these have been read."""
 
     def __init__(self, path: Path, keep_all: bool = False) -> None:
         """Open the file. Raises BagError if it cannot be read or is no MCAP file.
 
-        `keep_all`: attachments, and the messages of channels that are not described, whose topic nobody knows.
+        `keep_all`: attachments, records of unknown kinds, and the messages of channels that are not described, whose
+        topic nobody knows.
         """
         self.path = path
         self.findings = Findings()
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.attachments: list[Attachment] = []
+        self.foreign: list[Foreign] = []
         self.statistics: Statistics | None = None
         self.counts: Counter[int] = Counter()
         """Messages found by channel."""
@@ -123,6 +120,7 @@ class McapFile:
         self._keep_all = keep_all
         self._definitions = Definitions(self.findings)
         self._is_proven = False
+        self._is_behind_data = False
         self._damages = 0
         self._source = Source(path)
         try:
@@ -213,7 +211,8 @@ class McapFile:
         for record in self._sound_records(begin, end):
             if record.opcode == STATISTICS and (is_proven or not footer.crc):
                 self.statistics = parse_statistics(record.content)
-            self._define(Definition(record.opcode, record.content), is_proven)
+            elif record.opcode in (SCHEMA, CHANNEL):
+                self._note(record.opcode, record.content, is_proven, record.position)
         if self.statistics is None:
             self.findings.add("file without statistics, in which a missing message would go undetected")
 
@@ -305,37 +304,51 @@ class McapFile:
 
     def _take(self, record: Record, packed: Packed | None) -> None:
         """Take note of a record outside of chunks that holds no messages."""
-        try:
-            if record.opcode == MESSAGE_INDEX and packed is not None:
+        if record.opcode == MESSAGE_INDEX and packed is not None:
+            try:
                 packed.indexes.append(parse_index(record.content))
-            elif record.opcode == METADATA:
-                self.metadata.append(parse_metadata(record.content))
-                if not self._is_proven:
-                    self.findings.add_unchecked("metadata records")
-            elif record.opcode == DATA_END and record.extra:  # not where it was looked for
+            except DamagedError as error:
+                self._refuse(error, record.position)
+            return
+        if record.opcode == DATA_END:
+            self._is_behind_data = True
+            if record.extra:  # not where it was looked for
                 self._compare_data_section(record)
-            elif record.opcode == ATTACHMENT:
-                self._take_attachment(record)
-            else:
-                self._define(Definition(record.opcode, record.content), self._is_proven)
-        except DamagedError as error:
-            self.findings.add(f"damaged record, not used ({error})", at=record.position)
+        self._note(record.opcode, record.content, self._is_proven, record.position)
 
-    def _take_attachment(self, record: Record) -> None:
-        attachment, crc, covered = parse_attachment(record.content)
-        if crc and crc32(record.content[:covered]) != crc:
-            self.findings.add("attachment that does not match its CRC, left out", at=record.position, is_loss=True)
+    def _note(self, opcode: int, content: bytes, is_proven: bool, position: int) -> None:
+        """Take note of what a record holds, wherever it lies; `is_proven`: a CRC covers it."""
+        try:
+            if not is_known(opcode):
+                self._keep(Foreign(opcode, content), position)
+            elif opcode in (SCHEMA, CHANNEL):
+                self._definitions.add(Definition(opcode, content), is_proven)
+            elif opcode == METADATA:
+                self.metadata.append(parse_metadata(content))
+                if not is_proven:
+                    self.findings.add_unchecked("metadata records")
+            elif opcode == ATTACHMENT:
+                self._take_attachment(content, position)
+        except DamagedError as error:
+            self._refuse(error, position)
+
+    def _refuse(self, error: DamagedError, position: int) -> None:
+        self.findings.add(f"damaged record, not used ({error})", at=position)
+
+    def _keep(self, record: Foreign, position: int) -> None:
+        """Keep a record of a kind that is not known here; the summary may repeat those of the data section."""
+        kind = "private" if record.opcode >= PRIVATE else "unknown"
+        done = "copied as it is" if self._keep_all else "passed over"
+        self.findings.add(f"record of the {kind} kind {record.opcode}, {done}", at=position)
+        if self._keep_all and not (self._is_behind_data and record in self.foreign):
+            self.foreign.append(record)
+
+    def _take_attachment(self, content: bytes, position: int) -> None:
+        attachment, crc, covered = parse_attachment(content)
+        if crc and crc32(content[:covered]) != crc:
+            self.findings.add("attachment that does not match its CRC, left out", at=position, is_loss=True)
         else:
             self.attachments.append(attachment if self._keep_all else attachment._replace(content=b""))
-
-    def _define(self, definition: Definition, is_proven: bool) -> None:
-        if not is_known(definition.opcode):
-            self.findings.add(_unknown(definition.opcode))
-        elif definition.opcode in (SCHEMA, CHANNEL):
-            try:
-                self._definitions.add(definition, is_proven)
-            except DamagedError as error:
-                self.findings.add(f"damaged definition of a topic, not used ({error})")
 
     def _records(self) -> Iterator[Record | Item]:
         """Everything sound in the file, in order; what is not is passed over and reported."""
@@ -365,14 +378,11 @@ class McapFile:
             return self._run(record)
         if record.opcode == CHUNK:
             return self._packed(record)
-        if is_known(record.opcode):
-            return record, record.end
-        if packed := self._disguised(record):
+        if not is_known(record.opcode) and (packed := self._disguised(record)):
             return packed, record.end
-        if not self._source.is_followed(record.end):
+        if not is_known(record.opcode) and not self._source.is_followed(record.end):
             raise DamagedError(f"a record of the unknown kind {record.opcode}")
-        self.findings.add(_unknown(record.opcode), at=position)
-        return None, record.end
+        return record, record.end
 
     def _disguised(self, record: Record) -> Packed | None:
         """The chunk that a record is whose opcode says otherwise; None if it has not the shape of one."""
@@ -457,7 +467,7 @@ class McapFile:
         if found.lost:
             self.findings.add("byte in a chunk that belongs to no whole record", found.lost, at=position, is_loss=True)
         for definition in found.definitions:
-            self._define(definition, is_proven)
+            self._note(definition.opcode, definition.content, is_proven, position)
         yield from self._split(np.frombuffer(content, np.uint8), found.messages, is_wanted)
 
     def _split(

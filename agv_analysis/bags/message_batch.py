@@ -81,6 +81,12 @@ class Layouts:
         self.first_misfit = ""
         """Why the first of them is not."""
 
+    @property
+    def places(self) -> frozenset[tuple[str, str, int | None, tuple[int, ...]]]:
+        """Where in messages the values lie, over all layouts."""
+        leaves = [leaf for layout in self._known.values() for leaf in layout.leaves]
+        return frozenset((leaf.path, leaf.code, leaf.block, tuple(leaf.offsets)) for leaf in leaves)
+
     def split(self, batch: Batch) -> list[Group]:
         """The messages of a batch by layout; those that are not of the topic's type are counted as misfits.
 

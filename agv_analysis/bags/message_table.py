@@ -16,7 +16,7 @@ from agv_analysis.bags.compiled_decoder import MAX_LAYOUTS, Run, compiled_place,
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
 from agv_analysis.bags.message_batch import Batch, Bytes, Group, Ints, Layouts, values_at
 from agv_analysis.bags.prefault import Prefault
-from agv_analysis.bags.schema import PLACEHOLDER, STRING, Struct
+from agv_analysis.bags.schema import PLACEHOLDER, STRING, Struct, is_wstring
 
 _MISFITS_BELIEVED = 100
 """After this many messages, none of which is of its type, the definition is not theirs."""
@@ -25,6 +25,9 @@ _PADDING_FREE = 64 * 2**20
 _PADDING_FACTOR = 16
 """A table may take this many bytes, or this many times the bytes of its messages: since every row is as wide as the
 longest string or sequence, one long message among many short ones could otherwise ask for any amount of memory."""
+
+_UTF8_BYTES = {"u2": 3, "u4": 4}
+"""Most bytes that a character of a wstring takes in UTF-8, by its own form."""
 
 _MAX_ROOM = 2**30
 """Most bytes that are set aside for messages which are merely expected."""
@@ -58,9 +61,11 @@ class _Column:
 
     def fit(self, leaf: Leaf) -> None:
         """Make room for the values of a leaf."""
-        if self.code == "S":
+        if leaf.is_text:
+            self.width = max(self.width, _UTF8_BYTES[leaf.code[1:]] * (leaf.block or 0))
+        elif self.code == "S":
             self.width = max(self.width, int(leaf.code[1:]))
-        inner = () if leaf.block is None else (leaf.block - 1,)
+        inner = () if leaf.block is None or leaf.is_text else (leaf.block - 1,)
         self.fit_places([(*index, *inner) for index in leaf.indices])
 
     def fit_places(self, places: list[Index]) -> None:
@@ -81,7 +86,8 @@ def _columns(kind: Struct, prefix: str = "", dims: tuple[int, ...] = ()) -> Iter
         if isinstance(member.element, Struct):
             yield from _columns(member.element, f"{path}.", inner)
         elif not path.endswith(PLACEHOLDER):
-            yield path, _Column("S" if member.element == STRING else member.element, list(inner))
+            is_text = member.element == STRING or is_wstring(member.element)
+            yield path, _Column("S" if is_text else member.element, list(inner))
 
 
 class Table:
@@ -267,7 +273,7 @@ class Table:
     def _run(self, leaf: Leaf) -> Run | None:
         """A leaf as bytes, None if its values are in another form than in the table."""
         column = self._dtype.fields.get(leaf.path) if self._dtype.fields else None
-        if column is None or leaf.indices != [()]:
+        if column is None or leaf.indices != [()] or leaf.is_text:
             return None
         kind, target, code = column[0], int(column[1]), np.dtype(leaf.code)
         if kind.kind == "S":  # what it does not fill is zero already
@@ -304,8 +310,10 @@ def _ranks(places: list[Ints], total: int) -> Ints:
 
 def _write_leaf(column: NDArray[Any], rows: slice | Ints, leaf: Leaf, messages: Bytes) -> None:
     """Write the values of a leaf to the rows `rows` of a column."""
-    block = () if leaf.block is None else (slice(0, leaf.block),)
+    block = () if leaf.block is None or leaf.is_text else (slice(0, leaf.block),)
     values = _values(messages, leaf)
+    if leaf.is_text:
+        values = _texts(values)
     if leaf.indices == [()]:
         place: tuple[Any, ...] = (rows, *block)
         column[place] = values[:, 0]
@@ -325,3 +333,16 @@ def _values(messages: Bytes, leaf: Leaf) -> NDArray[Any]:
         shape = (n, size - item * leaf.block + 1, leaf.block)
         windows = np.ndarray(shape, leaf.code, messages.data, strides=(size, 1, item))
     return windows[:, leaf.offsets]
+
+
+def _texts(characters: NDArray[Any]) -> NDArray[np.bytes_]:
+    """Wide strings, shape (n, k, b), as UTF-8, shape (n, k).
+
+    ROS's are UTF-16; what writes 4 bytes a character widens each half of a surrogate pair, or is true UTF-32.
+    """
+    n, k, length = characters.shape
+    code = "<u2" if characters.max(initial=0) < 2**16 else "<u4"
+    form = "utf-16-le" if code == "<u2" else "utf-32-le"
+    rows = characters.reshape(-1, length).astype(code)
+    texts = [row.tobytes().decode(form, "replace").encode() for row in rows]
+    return np.array(texts, np.bytes_).reshape(n, k)

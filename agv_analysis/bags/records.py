@@ -202,6 +202,13 @@ class Attachment(NamedTuple):
     content: bytes
 
 
+class Foreign(NamedTuple):
+    """A record of a kind that is not known here: an application's own, or of a newer version of MCAP."""
+
+    opcode: int
+    content: bytes
+
+
 def parse_schema(content: bytes) -> Schema:
     """Schema record. Raises DamagedError."""
     cursor = Cursor(content)

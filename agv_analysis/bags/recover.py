@@ -5,27 +5,31 @@ A message is copied whether or not its definition is known and describes it: the
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
 from agv_analysis.bags.bag import Progress
 from agv_analysis.bags.bag_errors import BagError, UndecodableError
+from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.known_types import Definition, KnownTypes
-from agv_analysis.bags.message_batch import NO_DEFINITION, Batch, Layouts
+from agv_analysis.bags.message_batch import Batch, Layouts
 from agv_analysis.bags.message_compression import inflated_batches
-from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
+from agv_analysis.bags.records import DATA_END_SIZE, FOOTER_SIZE, MAGIC, QOS, RECORD, TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
-from agv_analysis.bags.schema import parse_schema
 from agv_analysis.bags.storage import Storage
+from agv_analysis.bags.topic_types import TopicTypes
 from agv_analysis.bags.writer import TopicInfo, metadata_text, rosbag2_metadata
+
+_PIECE = 2**20
 
 
 class Recovery(NamedTuple):
@@ -46,7 +50,8 @@ def recover(path: Path, out: Path, progress: Progress | None = None, definitions
     distribution, if that is known to describe the messages. Raises BagError if nothing can be read, or if `out` exists
     or cannot be written.
     """
-    contents, types = locate(path), KnownTypes(definitions)
+    contents = locate(path)
+    types = TopicTypes(contents, KnownTypes(definitions), is_thorough=True)
     is_file = out.suffix == ".mcap"
     writing = out.with_name(out.name + ".part")
     if out.exists() or writing.exists():
@@ -57,7 +62,7 @@ def recover(path: Path, out: Path, progress: Progress | None = None, definitions
             writing.mkdir()
         target = writing if is_file else writing / f"{out.name}_0.mcap"
         try:
-            copy = _Copy(target, contents, types)
+            copy = _Copy(target, out.name if is_file else target.name, contents, types)
             for number, storage in enumerate(open_files(contents, keep_all=True)):
                 for share in copy.add(storage):
                     if progress is not None:
@@ -76,11 +81,11 @@ def recover(path: Path, out: Path, progress: Progress | None = None, definitions
 class _Checked:
     """Messages of one topic and definition, and how many of them the definition does not describe."""
 
-    def __init__(self, channel: Channel, schema: Schema | None, define: Callable[[Schema], Definition]) -> None:
+    def __init__(self, channel: Channel, schema: Schema | None, define: Callable[[], Definition]) -> None:
         """`schema` is what the bag says of the type, `define` gives its definition, from wherever there is one."""
         self._layouts: Layouts | None = None
         self.schema = schema
-        """With a definition from elsewhere if the bag has none and that describes the first message."""
+        """With a definition from elsewhere if the bag has none and that describes its messages."""
         self._definition: Definition | None = None
         self._reason = ""
         """Why messages cannot be held against the definition, if so."""
@@ -88,11 +93,9 @@ class _Checked:
         try:
             if channel.encoding != "cdr":
                 raise UndecodableError(f"they are encoded as {channel.encoding!r}")
-            if schema is None:
-                raise UndecodableError(NO_DEFINITION)
-            self._definition = define(schema)
+            self._definition = define()
             self.schema = self._definition.schema
-            self._layouts = Layouts(parse_schema(self.schema.name, self.schema.encoding, self.schema.text))
+            self._layouts = Layouts(self._definition.form)
         except UndecodableError as error:
             self._reason = str(error)
 
@@ -107,7 +110,7 @@ class _Checked:
 
     def report(self, topic: str, findings: Findings) -> None:
         """Say which messages were copied although nothing describes them."""
-        if self._definition is not None and self._definition.source:
+        if self._definition is not None and self._definition.is_worth_a_note:
             findings.add(f"{topic}: {self._definition.note} written")
         if self._reason and self._count:
             findings.add(f"{topic}: message copied as it is, unchecked ({self._reason})", self._count)
@@ -120,8 +123,11 @@ class _Checked:
 class _Copy:
     """A new MCAP file in the course of being written."""
 
-    def __init__(self, path: Path, contents: Contents, types: KnownTypes) -> None:
-        self.path = path
+    def __init__(self, path: Path, name: str, contents: Contents, types: TopicTypes) -> None:
+        """`name`: what the file is called in the end."""
+        self._name = name
+        self._distro = contents.distro
+        self._has_foreign = False
         self._contents = contents
         self._types = types
         self.findings = Findings()
@@ -131,7 +137,7 @@ class _Copy:
         self._topics: dict[str, TopicInfo] = {}
         self._checked: dict[tuple[str, str, int], _Checked] = {}
         self._first_ns, self._last_ns = 2**63 - 1, 0
-        self._file = path.open("xb")
+        self._file = path.open("x+b")
         self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
         self._writer.start(profile="ros2", library="agv_ncs")
 
@@ -146,6 +152,10 @@ class _Copy:
                 self.counts[channel.topic] += 1
                 self._first_ns, self._last_ns = min(self._first_ns, log_time), max(self._last_ns, log_time)
             yield storage.position / max(1, storage.size)
+        for record in storage.foreign:
+            self._file.write(RECORD.pack(record.opcode, len(record.content)) + record.content)
+            self._has_foreign = True
+        self._distro = self._distro or storage.distro
         for channel in storage.channels.values():
             self._channel(storage, channel)
         for name, content in storage.metadata:
@@ -166,11 +176,8 @@ class _Copy:
 
     def _first(self, storage: Storage, channel: Channel, batch: Batch) -> _Checked:
         """What the first messages of a channel are held against."""
-        begin, kind = int(batch.starts[0]), self._contents.types.get(channel.topic)
-        message = batch.buffer[begin : begin + int(batch.sizes[0])].tobytes()
-        distro, type_hash = storage.distro or self._contents.distro, channel.metadata.get(TYPE_HASH, "")
-        schema = storage.schemas.get(channel.schema_id) or (Schema(0, kind, "", b"") if kind else None)
-        return _Checked(channel, schema, lambda schema: self._types.define(schema, distro, type_hash, message))
+        schema = self._types.named(storage, channel)
+        return _Checked(channel, schema, lambda: self._types.define(storage, channel, batch))
 
     def _channel(self, storage: Storage, channel: Channel) -> int:
         """Number of a channel in the clean file."""
@@ -196,12 +203,27 @@ class _Copy:
             checked.report(topic, self.findings)
         topics = [(topic, self.counts[name]) for name, topic in sorted(self._topics.items())]
         first = min(self._first_ns, self._last_ns)
-        about = rosbag2_metadata(self.path.name, first, self._last_ns, topics)
-        if metadata is not None:
+        about = rosbag2_metadata(self._name, first, self._last_ns, topics, self._distro, self._contents.custom_data)
+        if metadata is not None or self._distro:
             self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata_text(about)})
+        if metadata is not None:
             metadata.write_text(metadata_text({"rosbag2_bagfile_information": about}), encoding="utf-8")
         self._writer.finish()  # type: ignore[no-untyped-call]
+        if self._has_foreign:
+            _seal(self._file)
         self._file.close()
+
+
+def _seal(file: BinaryIO) -> None:
+    """Put the CRC of the data section right, which the library computes without records that it did not write."""
+    file.seek(RECORD.size - FOOTER_SIZE - len(MAGIC), os.SEEK_END)
+    data_end = int.from_bytes(file.read(8), "little") - DATA_END_SIZE
+    crc, left = 0, data_end
+    file.seek(0)
+    while left and (piece := file.read(min(left, _PIECE))):
+        crc, left = crc32(piece, crc), left - len(piece)
+    file.seek(data_end + RECORD.size)
+    file.write(crc.to_bytes(4, "little"))
 
 
 def _in_file_order(batches: Iterator[tuple[Channel, Batch]]) -> Iterator[tuple[Channel, int, int, bytes]]:

@@ -63,6 +63,8 @@ class Contents:
     """Types by topic."""
     distro: str = ""
     """ROS distribution of the recorder."""
+    custom_data: dict[str, str] | None = None
+    """What whoever recorded it has said of it (`ros2 bag record --custom-data`)."""
     findings: Findings = field(default_factory=Findings)
 
     def compare(self, topics: Mapping[str, _Found], findings: Findings) -> None:
@@ -298,6 +300,8 @@ def _by_metadata(path: Path) -> Contents:
         return contents
     types = {name: kind for name, kind, _ in topics}
     contents = Contents([], counts, types, str(about.get("ros_distro") or ""))
+    custom = about.get("custom_data")
+    contents.custom_data = {str(key): str(text) for key, text in custom.items()} if isinstance(custom, dict) else None
     contents.files = _present(path, listed, contents.findings)
     if not contents.files:
         raise BagError(f"{path}: none of the files that {METADATA} names is there{_advice(path)}")

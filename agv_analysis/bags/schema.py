@@ -15,6 +15,10 @@ from agv_analysis.bags.idl import definitions_in_idl
 
 STRING = "string"
 
+WSTRING = "wstring"
+WIDTHS = (4, 2)
+"""Bytes of a character of a wstring, which its encapsulation does not tell: Fast CDR writes 4 in version 1, 2 in 2."""
+
 PLACEHOLDER = "structure_needs_at_least_one_member"
 """The member that ROS 2 gives to a message without any, because IDL knows no such struct."""
 
@@ -52,7 +56,7 @@ class Member:
     path: str
     """Dotted path within its struct."""
     element: str | Struct
-    """numpy's code of a primitive, STRING, or the struct that an array consists of."""
+    """numpy's code of a primitive, STRING, a wstring with its width ("wstring2"), or what an array consists of."""
     length: int | None = None
     """Elements of an array, None for a single value; the bound of a sequence, None where it has none."""
     is_sequence: bool = False
@@ -74,14 +78,26 @@ class Struct:
         """Can two messages of this type differ in their number of values?"""
         return any(m.is_sequence or (isinstance(m.element, Struct) and m.element.has_sequences) for m in self.members)
 
+    @property
+    def has_wstrings(self) -> bool:
+        """Does the layout depend on how wide the characters of a wstring are?"""
+        return any(
+            m.element.has_wstrings if isinstance(m.element, Struct) else is_wstring(m.element) for m in self.members
+        )
 
-def parse_schema(name: str, encoding: str, text: str) -> Struct:
-    """Members of the type `name` ("geometry_msgs/msg/PoseStamped").
+
+def is_wstring(element: str) -> bool:
+    """Is this member a wstring, of whatever width?"""
+    return element.startswith(WSTRING)
+
+
+def parse_schema(name: str, encoding: str, text: str, width: int = WIDTHS[0]) -> Struct:
+    """Members of the type `name` ("geometry_msgs/msg/PoseStamped"); `width`: bytes of a character of its wstrings.
 
     Raises UndecodableError if the text is not understood, lacks a type, or describes a type without end.
     """
     texts = definitions_by_name(name, encoding, text)
-    return Struct(tuple(_Unfolding(texts).members(short_name(name), "", 0)))
+    return Struct(tuple(_Unfolding(texts, width).members(short_name(name), "", 0)))
 
 
 def definitions_by_name(name: str, encoding: str, text: str) -> dict[str, str]:
@@ -122,8 +138,9 @@ def _by_name(name: str, text: str) -> dict[str, str]:
 class _Unfolding:
     """Unfolds a type into members, counting them."""
 
-    def __init__(self, texts: dict[str, str]) -> None:
+    def __init__(self, texts: dict[str, str], width: int) -> None:
         self._texts = texts
+        self._width = width
         self._count = 0
 
     def members(self, name: str, prefix: str, depth: int) -> Iterator[Member]:
@@ -148,6 +165,8 @@ class _Unfolding:
         is_array = member.is_sequence or member.length is not None
         if kind == STRING or kind in PRIMITIVES:
             yield Member(path, PRIMITIVES.get(kind, STRING), member.length, member.is_sequence)
+        elif kind == WSTRING:
+            yield Member(path, f"{WSTRING}{self._width}", member.length, member.is_sequence)
         elif is_array:
             struct = Struct(tuple(self.members(resolve_type(self._texts, kind, parent), "", depth + 1)))
             yield Member(path, struct, member.length, member.is_sequence)
@@ -176,8 +195,6 @@ def parse_line(line: str) -> Member | None:
         raise UndecodableError(f"its definition has a line that is not understood: {line[:80]!r}")
     if found["rest"].lstrip().startswith("="):
         return None
-    if found["type"] == "wstring":
-        raise UndecodableError(f"its member {found['name']!r} is a wstring, which is not decoded")
     length = int(found["length"]) if found["length"] else None
     if length is not None and length > 2**32:
         raise UndecodableError(f"its member {found['name']!r} has {length} elements")

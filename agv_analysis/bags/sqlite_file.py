@@ -24,7 +24,7 @@ import numpy as np
 from agv_analysis.bags.bag_errors import BagError
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.message_batch import Batch
-from agv_analysis.bags.records import QOS, TYPE_HASH, Attachment, Channel, Schema
+from agv_analysis.bags.records import QOS, TYPE_HASH, Attachment, Channel, Foreign, Schema
 from agv_analysis.bags.storage import IsWanted, undescribed
 
 _ROWS = 16384
@@ -54,6 +54,7 @@ class SqliteFile:
         self.findings = Findings()
         self.metadata: list[tuple[str, dict[str, str]]] = []
         self.attachments: list[Attachment] = []
+        self.foreign: list[Foreign] = []
         self.counts: Counter[int] = Counter()
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}

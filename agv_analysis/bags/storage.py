@@ -10,7 +10,7 @@ from typing import Protocol
 
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.message_batch import Batch
-from agv_analysis.bags.records import Attachment, Channel, Schema
+from agv_analysis.bags.records import Attachment, Channel, Foreign, Schema
 
 LARGE = 2**28
 LARGE_ONCE_LOADED = 2**24
@@ -40,6 +40,8 @@ class Storage(Protocol):
     """Metadata records: name and content; a name may be there more than once."""
     attachments: list[Attachment]
     """With their content if the storage was opened to keep all, else without."""
+    foreign: list[Foreign]
+    """Records of kinds that are not known here, if the storage was opened to keep all."""
     counts: Counter[int]
     """Messages found by channel."""
     position: int

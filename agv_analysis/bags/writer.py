@@ -148,7 +148,12 @@ class BagWriter:
 
 
 def rosbag2_metadata(
-    file_name: str, first_ns: int, last_ns: int, topics: Sequence[tuple[TopicInfo, int]]
+    file_name: str,
+    first_ns: int,
+    last_ns: int,
+    topics: Sequence[tuple[TopicInfo, int]],
+    distro: str = "jazzy",
+    custom_data: dict[str, str] | None = None,
 ) -> dict[str, Any]:
     """What metadata.yaml says of a bag of one MCAP file; `topics` with their number of messages."""
     start = {"nanoseconds_since_epoch": first_ns}
@@ -168,8 +173,8 @@ def rosbag2_metadata(
         "compression_mode": "",
         "relative_file_paths": [file_name],
         "files": [file],
-        "custom_data": None,
-        "ros_distro": "jazzy",
+        "custom_data": custom_data,
+        "ros_distro": distro,
     }
 
 

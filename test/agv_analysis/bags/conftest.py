@@ -289,3 +289,8 @@ def make_record() -> Callable[[int, bytes], bytes]:
 @pytest.fixture
 def make_database() -> Callable[..., Path]:
     return write_database
+
+
+@pytest.fixture
+def make_mcap() -> Callable[..., Path]:
+    return write_mcap

@@ -254,7 +254,6 @@ def test_one_long_message_among_short_ones_does_not_take_all_memory() -> None:
     [
         ("a/B b", "without describing it"),
         ("a/A a", "nested more than"),
-        ("wstring text", "wstring"),
         ("int32", "not understood"),
         ("int32 x\n" + "=" * 80 + "\nnothing", "instead of 'MSG: type'"),
     ],

@@ -16,6 +16,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from agv_analysis.bags import Bag, BagError, read_bag
+from agv_analysis.bags.message_batch import NO_DEFINITION
 from agv_analysis.bags.recover import recover
 from agv_analysis.cli import main
 
@@ -99,6 +100,141 @@ def test_a_type_without_members_needs_no_definition(tmp_path: Path) -> None:
         bag = read_bag(write(tmp_path / "a.mcap", kind, [b"\0\1\0\0\0"] * 2))
         assert len(bag["/t"]) == 2
         assert bag.problems == ()
+
+
+ZEROS = b"\0\1\0\0\0"
+"""As of a message without members, or with members that are zero."""
+
+
+@pytest.mark.parametrize(
+    "payloads",
+    [
+        [ZEROS, ZEROS, b"\0\1\0\0\1", ZEROS],
+        [ZEROS + bytes(3), ZEROS + b"\0\0\1"],
+        [ZEROS] * 200 + [b"\0\1\0\0" + bytes(5)],
+        [b"\0\1\0\0" + bytes(8)] * 2,
+    ],
+)
+@pytest.mark.parametrize("files", [1, 2])
+def test_what_may_have_no_members_is_judged_by_all_of_its_messages(
+    tmp_path: Path, payloads: list[bytes], files: int
+) -> None:
+    (tmp_path / "bag").mkdir()
+    for number in range(files):
+        some = payloads[: len(payloads) // 2] if number < files - 1 else payloads[len(payloads) // 2 * (files - 1) :]
+        write(tmp_path / "bag" / f"bag_{number}.mcap", "my_msgs/msg/Flag", some)
+    bag = read_bag(tmp_path / "bag")
+    assert any(problem.startswith(f"/t: topic that cannot be decoded: {NO_DEFINITION}") for problem in bag.problems)
+    assert bag.is_complete
+    assert bag.topics["/t"].definition == ""
+    assert bag.payloads("/t") == payloads
+    assert len(bag.log_times("/t")) == len(payloads)
+    recovery = recover(tmp_path / "bag", tmp_path / "out")
+    assert recovery.is_complete
+    assert f"/t: message copied as it is, unchecked ({NO_DEFINITION}): {len(payloads)}" in recovery.problems
+    assert read_bag(tmp_path / "out").payloads("/t") == payloads
+
+
+ARRAY = "visualization_msgs/msg/MarkerArray"
+FOXY = get_typestore(Stores.ROS2_FOXY)
+"""In Humble `texture` and more were added to Marker; without markers, arrays of both look the same."""
+
+
+def marker_array(store: Any, count: int) -> bytes:
+    types = store.types
+
+    def blank(kind: str) -> Any:
+        """A message of zeros, whatever members this distribution gives it."""
+        values: list[Any] = []
+        for _, (form, content) in store.fielddefs[kind][1]:
+            if form.name == "BASE":
+                values.append("" if content[0] == "string" else 0)
+            elif form.name == "NAME":
+                values.append(blank(content))
+            else:
+                values.append(np.zeros(0, np.uint8) if content[0][1][0] == "uint8" else [])
+        return types[kind](*values)
+
+    return bytes(store.serialize_cdr(types[ARRAY]([blank("visualization_msgs/msg/Marker")] * count), ARRAY))
+
+
+@pytest.mark.parametrize(
+    ("store", "source"), [(FOXY, "foxy to galactic"), (HUMBLE, "jazzy to lyrical")], ids=["Foxy", "Humble"]
+)
+def test_of_several_definitions_all_messages_decide(tmp_path: Path, store: Any, source: str) -> None:
+    """As a node starts that has nothing to show yet."""
+    payloads = [marker_array(store, count) for count in (0, 0, 2, 1)]
+    path = write(tmp_path / "a.mcap", ARRAY, payloads)
+    bag = read_bag(path)
+    assert bag["/t"]["len(markers)"].tolist() == [0, 0, 2, 1]
+    assert bag.is_complete
+    assert borrowed(bag) == [f"/t: topic whose definition is not in the bag, that of ROS 2 {source} used: 1"]
+    assert f"that of ROS 2 {source} written: 1" in "".join(recover(path, tmp_path / "out.mcap").problems)
+    assert read_bag(tmp_path / "out.mcap")["/t"]["len(markers)"].tolist() == [0, 0, 2, 1]
+
+
+def test_what_several_definitions_describe_is_not_decoded(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", ARRAY, [marker_array(HUMBLE, 0)] * 3)
+    bag = read_bag(path)
+    with pytest.raises(BagError, match="there are several that describe its messages"):
+        bag["/t"]
+    assert bag.is_complete
+    assert recover(path, tmp_path / "out.mcap").counts == {"/t": 3}
+
+
+def test_one_damaged_message_does_not_decide(tmp_path: Path) -> None:
+    """Be it the first: the definition is that of the others."""
+    payloads = [ranges(HUMBLE)[0][:-7], *ranges(HUMBLE)]
+    bag = read_bag(write(tmp_path / "a.mcap", RANGE, payloads, distro="humble"))
+    assert bag["/t"]["range"].tolist() == [0.0, 1.0, 2.0]
+    assert not bag.is_complete
+
+
+def test_a_definition_from_elsewhere_that_describes_few_messages_is_not_theirs(tmp_path: Path) -> None:
+    (tmp_path / "Few.msg").write_text("float32[] x\n")
+    payloads = [b"\0\1\0\0\0\0\0\0"] + [b"\0\1\0\0\2\0\0\0" + bytes(32)] * 5
+    path = write(tmp_path / "a.mcap", "my_msgs/msg/Few", payloads)
+    bag = read_bag(path, definitions=tmp_path)
+    with pytest.raises(BagError, match="does not describe 5 of its 6 messages"):
+        bag["/t"]
+    assert bag.is_complete
+    recovery = recover(path, tmp_path / "out.mcap", definitions=tmp_path)
+    assert recovery.is_complete
+    assert recovery.counts == {"/t": 6}
+
+
+# -- wide strings -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [2, 4])
+def test_wide_strings_of_either_width(tmp_path: Path, width: int) -> None:
+    """Fast CDR 1 writes a character in four bytes, Fast CDR 2 in two; both count characters."""
+    texts = ["", "a", "grün", "€", "\N{PERSONAL COMPUTER}!"]
+
+    def wide(text: str) -> bytes:
+        units = np.frombuffer(text.encode("utf-16-le"), "<u2")
+        return len(units).to_bytes(4, "little") + units.astype(f"<u{width}").tobytes()
+
+    def message(text: str) -> bytes:
+        data = wide(text)
+        data += bytes(-len(data) % 4) + (2).to_bytes(4, "little") + wide("x")
+        data += bytes(-len(data) % 4) + wide(text)
+        return b"\0\1\0\0" + data + bytes(-len(data) % 4) + (7).to_bytes(4, "little")
+
+    schema = ("ros2msg", b"wstring name\nwstring[] many\nint32 after")
+    rows = read_bag(write(tmp_path / "a.mcap", "my_msgs/msg/Wide", [message(text) for text in texts], schema))["/t"]
+    assert [name.decode() for name in rows["name"].tolist()] == texts
+    assert [[name.decode() for name in row] for row in rows["many"].tolist()] == [["x", text] for text in texts]
+    assert rows["after"].tolist() == [7] * 5
+
+
+def test_wide_strings_without_any_character_have_no_width(tmp_path: Path) -> None:
+    schema = ("ros2msg", b"wstring name\nint32 after")
+    payloads = [b"\0\1\0\0\0\0\0\0\7\0\0\0"] * 2
+    bag = read_bag(write(tmp_path / "a.mcap", "my_msgs/msg/Wide", payloads, schema))
+    assert bag["/t"]["name"].tolist() == [b"", b""]
+    assert bag["/t"]["after"].tolist() == [7, 7]
+    assert bag.problems == ()
 
 
 WITHOUT_ROSBAGS = """

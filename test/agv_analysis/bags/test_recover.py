@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import CompressionType
 
 from agv_analysis.bags import BagError, read_bag
 from agv_analysis.bags.message_batch import NO_DEFINITION
@@ -84,3 +87,74 @@ def test_messages_whose_topic_is_not_known_are_recovered(tmp_path: Path, make_re
     assert recovery.counts == {"/undescribed_channel_1": 1}
     assert "message of channel 1, which is not described, so that its topic is not known: 1" in recovery.problems
     assert read_bag(tmp_path / "out.mcap").payloads("/undescribed_channel_1") == [b"\0\1\0\0\7\0\0\0"]
+
+
+# -- records of other kinds -------------------------------------------------------------------------------------------
+
+
+def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of each record of a file, those in chunks that are not compressed too."""
+    position = 8
+    while position < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        content = data[position + 9 : position + 9 + length]
+        yield opcode, content
+        if opcode == 6 and content[28:32] == bytes(4):
+            yield from records_of(bytes(8) + content[40:] + bytes(8))
+        position += 9 + length
+
+
+def with_foreign(path: Path, make_record: Callable[[int, bytes], bytes]) -> list[tuple[int, bytes]]:
+    """Put records of private and unknown kinds into a file: before, in and after chunks, and into the summary."""
+    data, position, parts = path.read_bytes(), 8, []
+    put: list[tuple[int, bytes]] = []
+
+    def new(opcode: int) -> bytes:
+        put.append((opcode, f"record {len(put)}".encode() + bytes(len(put))))
+        return make_record(*put[-1])
+
+    while position < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        whole = data[position : position + 9 + length]
+        if opcode == 6:
+            inner = new(0x81) + whole[49:] + new(0x20)
+            head = whole[9:25] + struct.pack("<QI", len(inner), zlib.crc32(inner)) + bytes(4)
+            whole = make_record(6, head + struct.pack("<Q", len(inner)) + inner)
+        if opcode == 2:
+            whole = make_record(*put[0]) + new(0x82) + make_record(2, bytes(20))
+        parts.append(whole + (new(0x80) if opcode in (1, 6) else b""))
+        position += 9 + length
+    path.write_bytes(data[:8] + b"".join(parts) + data[-8:])
+    return put
+
+
+@pytest.mark.parametrize("name", ["out.mcap", "out"])
+def test_records_of_private_and_unknown_kinds_are_copied_byte_by_byte(
+    make_mcap: Callable[..., Path], make_record: Callable[[int, bytes], bytes], tmp_path: Path, by_others: By, name: str
+) -> None:
+    path = make_mcap(tmp_path / "a.mcap", compression=CompressionType.NONE)
+    original = by_others(path)
+    put = with_foreign(path, make_record)
+    assert {opcode for opcode, _ in put} == {0x20, 0x80, 0x81, 0x82}
+    recovery = recover(path, tmp_path / name)
+    file = tmp_path / name if name.endswith(".mcap") else tmp_path / name / f"{name}_0.mcap"
+    found = list(records_of(file.read_bytes()))
+    assert sorted(part for part in found if part[0] >= 16) == sorted(put)
+    assert max(found.index(part) for part in put) < [opcode for opcode, _ in found].index(15)  # in the data section
+    for opcode, kind in ((0x20, "unknown"), (0x80, "private"), (0x81, "private"), (0x82, "private")):
+        count = sum(part[0] == opcode for part in put) + (opcode == put[0][0])
+        said = f"record of the {kind} kind {opcode}, copied as it is: {count}"
+        assert any(problem.startswith(said) for problem in recovery.problems), recovery.problems
+    with file.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()][:2] == [
+            ("notes", {"a": "1"}),
+            ("notes", {"a": "2"}),
+        ]
+        assert [a.data for a in reader.iter_attachments()] == [b"\x89PNG" + bytes(50)]
+    assert by_others(tmp_path / name) == original  # also compares the CRC of the data section
+    copy = read_bag(tmp_path / name)
+    assert copy.is_complete
+    assert {problem.split(",")[0] for problem in copy.problems} == {
+        f"record of the {'private' if opcode >= 0x80 else 'unknown'} kind {opcode}" for opcode, _ in put
+    }
