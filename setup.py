@@ -63,6 +63,8 @@ setup(
             "hypothesis>=6.80",
             "mcap-ros2-support>=0.5",
             "mypy>=1.10",
+            "pandas>=2.0",
+            "polars>=1.0",
             "pyarrow>=12.0",
             "pypdfium2>=4.0",
             "pytest>=7.4",

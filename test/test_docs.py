@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import math
 import re
 import subprocess
 import sys
+import textwrap
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -109,6 +112,31 @@ def test_the_python_of_the_readme_runs() -> None:
     )
     assert result.returncode == 0, result.stderr
     assert re.fullmatch(r"[a-z-]+ \d+\n", result.stdout), result.stdout
+
+
+def test_the_tables_of_the_page_of_bags_are_read_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from agv_analysis.bags import read_bag
+    from agv_analysis.bags.export import export_parquet
+
+    for library in ("pandas", "polars", "pyarrow"):
+        pytest.importorskip(library)
+    page = (REPOSITORY / "docs/bags.md").read_text()
+    (code,) = [block for block in re.findall(r"(?:^    .*\n|^\n)+", page, re.MULTILINE) if "import pandas" in block]
+    bag = read_bag(REPOSITORY / "bags/sample", topics=["/edge/error", "/edge/slot"])
+    export_parquet(bag, tmp_path / "tables")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    shown = []
+    for statement in ast.parse(textwrap.dedent(code)).body:
+        if isinstance(statement, ast.Expr):
+            shown.append(eval(compile(ast.Expression(statement.value), "bags.md", "eval"), names))
+        else:
+            exec(compile(ast.Module([statement], []), "bags.md", "exec"), names)
+    largest, slots, about = shown
+    assert largest.max() == bag["/edge/error"]["pose.pose.position.y"].max()
+    counts = {name.encode(): count for name, count in slots.rows()}
+    assert counts == dict(Counter(bag["/edge/slot"]["source"].tolist()))
+    assert about[b"unit"] == b"m/s"
 
 
 def test_the_commands_of_the_readme_exist(agv_ncs: Callable[..., tuple[int, str]]) -> None:

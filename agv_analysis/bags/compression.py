@@ -19,7 +19,8 @@ NAMES = ("", "zstd", "lz4")
 _OF_THREAD = threading.local()
 """A decompressor for each thread: to make one takes a tenth of the time that a chunk does."""
 
-_MAGICS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
+MAGICS = {"zstd": b"\x28\xb5\x2f\xfd", "lz4": b"\x04\x22\x4d\x18"}
+"""First bytes of compressed content."""
 
 
 def inflate(compression: str, content: bytes, size: int) -> bytes:
@@ -88,7 +89,7 @@ def _lz4_size(content: bytes) -> int | None:
 
 def compression_of(content: bytes) -> str:
     """Compression by what the content begins with."""
-    return next((name for name, magic in _MAGICS.items() if content.startswith(magic)), "")
+    return next((name for name, magic in MAGICS.items() if content.startswith(magic)), "")
 
 
 def _whole_zstd(content: bytes) -> bytes:

@@ -30,6 +30,9 @@ BODY = LEAD + 4
 
 _END_PADDING = 3
 
+_RESERVED_CHARACTER = 4
+"""Bytes that rmw_serialize reserves for each character of a wstring, and for a final zero that it does not write."""
+
 LOG_TIME, PUBLISH_TIME = "log_time_ns", "publish_time_ns"
 
 Index = tuple[int, ...]
@@ -94,7 +97,7 @@ def trace(kind: Struct, message: bytes) -> Layout:
     walk = _Trace(message)
     walk.struct(kind, "", ())
     rest = len(message) - BODY - walk.position
-    if rest > _END_PADDING:
+    if not (rest <= _END_PADDING or 0 <= walk.position + rest - walk.reserved <= _END_PADDING):
         raise UndecodableError(f"{rest} of its {size} bytes are left over after the last member")
     return Layout(
         message[LEAD] | message[LEAD + 1] << 8, walk.order, np.array(walk.guards, np.int64),
@@ -103,13 +106,18 @@ def trace(kind: Struct, message: bytes) -> Layout:
 
 
 class _Trace:
-    """The walk through one message; `position` counts from the end of the encapsulation header."""
+    """The walk through one message; `position` counts from the end of the encapsulation header.
+
+    `reserved` counts what rmw_serialize of rmw_fastrtps reserves before it writes: it aligns empty sequences, too. A
+    message that a node serialised for a bag itself, as with rosbag2's writers in C++ and Python, has that length.
+    """
 
     def __init__(self, message: bytes) -> None:
         self._message = message
         self._end = len(message) - BODY
         self.order = "<" if message[LEAD + 1] else ">"
         self.position = 0
+        self.reserved = 0
         self.guards: list[int] = []
         self.lengths: list[int] = []
         self.leaves: dict[tuple[str, str, int | None], Leaf] = {}
@@ -157,6 +165,7 @@ class _Trace:
         if begin + size > self._end:
             raise UndecodableError(f"it ends after {len(self._message) - LEAD} bytes, before the end of {path}")
         self.position = begin + size
+        self.reserved += -self.reserved % alignment + size
         return BODY + begin
 
     def _add(self, path: str, code: str, block: int | None, index: Index, offset: int, is_text: bool = False) -> None:
@@ -169,6 +178,7 @@ class _Trace:
     def _numbers(self, path: str, code: str, count: int | None, index: Index) -> None:
         size = 1 if code == "?" else int(code[1])
         if count == 0:
+            self.reserved += -self.reserved % size
             return
         offset = self._take(path, size, size * (1 if count is None else count))
         self._add(path, ("u1" if code == "?" else self.order + code), count, index, offset)
@@ -192,6 +202,7 @@ class _Trace:
                 self._add(path, f"{self.order}u{width}", length, place, begin, is_text=True)
             else:
                 self._add(path, "S1", None, place, BODY + self.position - 4)
+            self.reserved += _RESERVED_CHARACTER * (length + 1) - width * length
 
     def _structs(self, kind: Struct, prefix: str, count: int, index: Index) -> None:
         if count > self._end - self.position:

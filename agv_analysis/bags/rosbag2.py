@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from agv_analysis.bags.bag_errors import BagError
-from agv_analysis.bags.compression import compression_of
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.mcap_file import McapFile
+from agv_analysis.bags.packed_files import archive_command, is_packed, unpack
 from agv_analysis.bags.records import MAGIC as MCAP
 from agv_analysis.bags.storage import Storage
 
@@ -27,16 +27,10 @@ METADATA = "metadata.yaml"
 SQLITE = b"SQLite format 3\0"
 """First bytes of a sqlite3 database."""
 
-_PACKED = (".zstd", ".zst")
+_PACKED = (".zstd", ".zst", ".gz", ".lz4", ".xz", ".bz2")
 """Endings of files that were compressed as a whole; the first is rosbag2's."""
 
 _STORAGES = (".mcap", ".db3")
-
-_MOST_TIMES = 1000
-_ALWAYS_UNPACKED = 2**30
-"""A file may decompress to this many times its size, or to this many bytes."""
-
-_PIECE = 2**22
 
 _MAX_METADATA = 2**26
 """Most bytes of a metadata.yaml; that of a bag with a thousand topics and files has one million."""
@@ -144,13 +138,17 @@ def open_files(contents: Contents, keep_all: bool = False) -> Iterator[Storage]:
         with contextlib.ExitStack() as stack:
             try:
                 file = path
-                if compression_of(_beginning(path)) == "zstd":
+                if is_packed(_beginning(path)):
                     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="agv_ncs_"))
-                    file = _unpack(path, Path(folder), contents.findings)
-                storage = _open(file, keep_all)
+                    file = Path(folder) / _unpacked_name(path.name)
+                    if damage := unpack(path, file):
+                        what = f"{path.name}: compressed file that is damaged, read up to there ({damage})"
+                        contents.findings.add(what, is_loss=True)
+                storage = _open(file, keep_all, path)
             except BagError as error:
+                error = BagError(str(error).replace(str(file), str(path)))  # where it lies, not where it was unpacked
                 if len(contents.files) == 1:
-                    raise
+                    raise error from None
                 contents.findings.add(f"file that cannot be read ({error})", is_loss=True)
                 continue
             stack.callback(storage.close)
@@ -165,28 +163,11 @@ def _beginning(path: Path) -> bytes:
         raise BagError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _unpack(path: Path, folder: Path, findings: Findings) -> Path:
-    """A file that was compressed as a whole, inflated, as far as it goes, to a file in `folder`. Raises BagError."""
-    import zstandard
-
-    target = folder / _unpacked_name(path.name)
-    try:
-        left = max(_ALWAYS_UNPACKED, _MOST_TIMES * path.stat().st_size)
-        with path.open("rb") as packed, target.open("xb") as file:
-            stream = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-            while left > 0 and (piece := stream.read(_PIECE)):
-                left -= file.write(piece)
-    except zstandard.ZstdError as error:
-        findings.add(f"{path.name}: compressed file that is damaged, read up to there ({error})", is_loss=True)
-    except OSError as error:
-        raise BagError(f"{path}: cannot be unpacked to {folder}: {error.strerror}") from None
-    if left <= 0:
-        raise BagError(f"{path}: inflates to more than {_MOST_TIMES} times its size, as no recording does")
-    return target
-
-
-def _open(path: Path, keep_all: bool) -> Storage:
+def _open(path: Path, keep_all: bool, given: Path) -> Storage:
+    """Open a file; `given`: as it was before it was unpacked."""
     begin = _beginning(path)
+    if (unpacking := archive_command(path, given)) is not None:
+        raise BagError(f"{given}: is an archive: `{unpacking}` unpacks it, then name the bag in it")
     if begin.startswith(b"#ROSBAG V"):
         raise BagError(f"{path}: is a ROS 1 bag; {_convert(path)}")
     if begin.startswith(SQLITE) or (path.suffix.lower() == ".db3" and begin):

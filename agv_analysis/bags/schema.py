@@ -17,7 +17,7 @@ STRING = "string"
 
 WSTRING = "wstring"
 WIDTHS = (4, 2)
-"""Bytes of a character of a wstring, which its encapsulation does not tell: Fast CDR writes 4 in version 1, 2 in 2."""
+"""Bytes of a character of a wstring, which its encapsulation does not tell: ROS 2 Jazzy writes 4, DDS-XTypes has 2."""
 
 PLACEHOLDER = "structure_needs_at_least_one_member"
 """The member that ROS 2 gives to a message without any, because IDL knows no such struct."""

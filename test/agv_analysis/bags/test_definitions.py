@@ -208,7 +208,7 @@ def test_a_definition_from_elsewhere_that_describes_few_messages_is_not_theirs(t
 
 @pytest.mark.parametrize("width", [2, 4])
 def test_wide_strings_of_either_width(tmp_path: Path, width: int) -> None:
-    """Fast CDR 1 writes a character in four bytes, Fast CDR 2 in two; both count characters."""
+    """rmw_fastrtps of Jazzy writes a character in four bytes, newer Fast CDR in two; both count characters."""
     texts = ["", "a", "grün", "€", "\N{PERSONAL COMPUTER}!"]
 
     def wide(text: str) -> bytes:
@@ -226,6 +226,40 @@ def test_wide_strings_of_either_width(tmp_path: Path, width: int) -> None:
     assert [name.decode() for name in rows["name"].tolist()] == texts
     assert [[name.decode() for name in row] for row in rows["many"].tolist()] == [["x", text] for text in texts]
     assert rows["after"].tolist() == [7] * 5
+
+
+def test_wide_strings_as_jazzy_writes_them(tmp_path: Path) -> None:
+    """By rclpy.serialize_message; at the end are bytes that it reserved and did not use."""
+    payload = bytes.fromhex(
+        "00010000" "00000000" "0c000000" "48000000650000006c0000006c0000006f00000020000000770000006f00000072000000"
+        "6c0000006400000021000000" "0c000000" "48000000650000006c0000006c000000f60000002000000077000000f6000000"
+        "720000006c0000006400000021000000" "07000000" "cf300000ed300000fc300000ef300000fc300000eb300000c9300000"
+        "000000000000000000000000" "00000000" "00000000" "050000006a0000000700000000000000000000000000000000000000"
+    )  # fmt: skip
+    text = (
+        'wstring wstring_value\nwstring wstring_value_default1 "Hello world!"\nwstring wstring_value_default2 \'Hellö '
+        "wörld!'\nwstring wstring_value_default3 'ハローワールド'\nwstring[3] array_of_wstrings\n"
+        "wstring[<=3] bounded_sequence_of_wstrings\nwstring[] unbounded_sequence_of_wstrings\n"
+    )
+    rows = read_bag(write(tmp_path / "a.mcap", "test_msgs/msg/WStrings", [payload], ("ros2msg", text.encode())))["/t"]
+    defaults = [rows[f"wstring_value_default{i}"][0].decode() for i in (1, 2, 3)]
+    assert defaults == ["Hello world!", "Hellö wörld!", "ハローワールド"]
+    assert rows["array_of_wstrings"].tolist() == [[b""] * 3]
+
+
+def test_messages_that_a_node_serialised_for_a_bag(tmp_path: Path) -> None:
+    """As the tutorials of rosbag2 do it: what was reserved for sequences without elements is part of the message."""
+    payload = bytes.fromhex(
+        "00010000" "00000000" "00000000" "02000000" "620057f0" "01000000" "05000000" "6c65667400" "9258f0" "01000000"
+        "a0edccf4" "000000000000e03f" "00000000" "00000000" "dc7f0000300f5bf4"
+    )  # fmt: skip
+    schema = ("ros2msg", JAZZY.generate_msgdef("sensor_msgs/msg/JointState", ros_version=2)[0].encode())
+    bag = read_bag(write(tmp_path / "a.mcap", "sensor_msgs/msg/JointState", [payload], schema))
+    assert bag["/t"]["name"].tolist() == [[b"left"]]
+    assert bag["/t"]["position"].tolist() == [[0.5]]
+    assert bag.is_complete
+    longer = read_bag(write(tmp_path / "b.mcap", "sensor_msgs/msg/JointState", [payload + bytes(8)], schema))
+    assert not longer.is_complete
 
 
 def test_wide_strings_without_any_character_have_no_width(tmp_path: Path) -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import bz2
 import contextlib
+import gzip
+import lzma
 import sqlite3
+import tarfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import zstandard
 
 from agv_analysis.bags import BagError, read_bag
 
@@ -150,3 +156,71 @@ def test_what_a_database_lacks_or_holds_in_another_form_does_not_refuse_it(
     assert bag["/reading"]["values"][:, 0].tolist() == [float(i) for i in range(7)]
     assert len(bag["/point"]) == 7
     assert "row that describes no topic, left out: 1" in bag.problems
+
+
+# -- files that were compressed by hand -------------------------------------------------------------------------------
+
+
+def _lz4(data: bytes) -> bytes:
+    import lz4.frame
+
+    return bytes(lz4.frame.compress(data))
+
+
+PACKERS: dict[str, Callable[[bytes], bytes]] = {
+    ".gz": gzip.compress, ".xz": lzma.compress, ".bz2": bz2.compress, ".lz4": _lz4, ".zst": zstandard.compress,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", PACKERS)
+@pytest.mark.parametrize("form", ["mcap", "sqlite3 of Humble", "directory of Humble", "directory without metadata"])
+def test_a_file_that_was_compressed_by_hand_is_read(
+    tmp_path: Path, odd_bag: Odd, by_others: Callable[[Path], Payloads], ending: str, form: str
+) -> None:
+    path = odd_bag(form.replace("without metadata", "of Humble"))
+    original = by_others(path)
+    file = path if path.is_file() else path / "bag_0.db3"
+    file.with_name(file.name + ending).write_bytes(PACKERS[ending](file.read_bytes()))
+    file.unlink()
+    if form == "directory without metadata":
+        (path / "metadata.yaml").unlink()
+    bag = read_bag(path if path.is_dir() else path.with_name(path.name + ending))
+    assert {topic: len(bag.payloads(topic)) for topic in bag.topics} == {t: len(data) for t, data in original.items()}
+    assert bag.is_complete
+
+
+@pytest.mark.parametrize("ending", PACKERS)
+def test_of_a_compressed_file_that_was_cut_the_beginning_is_read(tmp_path: Path, odd_bag: Odd, ending: str) -> None:
+    import os
+
+    path = odd_bag("mcap")
+    size = 2**21 if ending == ".bz2" else 2**17  # bzip2 inflates whole blocks of 900 kB
+    data = path.read_bytes() + os.urandom(size)  # behind the end, so that the cut is there
+    packed = PACKERS[ending](data)
+    (tmp_path / f"cut.mcap{ending}").write_bytes(packed[: len(packed) * 3 // 4])
+    bag = read_bag(tmp_path / f"cut.mcap{ending}")
+    assert len(bag["/point"]) == 7
+    assert any(problem.startswith(f"cut.mcap{ending}: compressed file that is damaged") for problem in bag.problems)
+    assert not bag.is_complete
+
+
+@pytest.mark.parametrize(("name", "command"), [("bags.tar.gz", "tar xf"), ("bags.tar", "tar xf"), ("a.zip", "unzip")])
+def test_an_archive_is_refused_with_the_command_that_unpacks_it(
+    tmp_path: Path, odd_bag: Odd, name: str, command: str
+) -> None:
+    bag = odd_bag("mcap")
+    if name.endswith(".zip"):
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            archive.write(bag)
+    else:
+        with tarfile.open(tmp_path / name, "w:gz" if name.endswith(".gz") else "w") as tar:
+            tar.add(bag)
+    with pytest.raises(BagError, match=f"is an archive: `{command} {tmp_path}/{name}` unpacks it") as error:
+        read_bag(tmp_path / name)
+    assert "\n" not in str(error.value)
+
+
+def test_an_error_names_the_compressed_file_and_not_what_was_made_of_it(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(b"no bag at all, but long enough for it"))
+    with pytest.raises(BagError, match=f"^{tmp_path}/a.mcap.gz: is no MCAP file"):
+        read_bag(tmp_path / "a.mcap.gz")

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.writer import Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from agv_analysis.bags import read_bag
 from agv_analysis.bags.column_notes import Note, column_notes
-from agv_analysis.bags.export import export_csv
+from agv_analysis.bags.export import export_csv, export_parquet
 from agv_analysis.bags.trajectories import trajectories_of
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -115,3 +115,60 @@ def test_columns_that_only_have_the_names_of_a_pose_are_none(odd: list[Any]) -> 
     rest = [(odd[-1][0][:-1] + axis, *odd[-1][1:]) for axis in "yz"] if len(odd[-1]) > 2 else []
     rows = np.zeros(3, [("log_time_ns", "i8"), *odd, *rest, *turn])
     assert list(trajectories_of(rows)) == []
+
+
+MIXED = """# which way [rad]
+float64 angle
+string name
+bool ok
+int64 whole
+float32[2] pair
+geometry_msgs/Point[] points
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+"""
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars", "pyarrow"])
+def test_other_libraries_read_parquet_as_it_was_sent(tmp_path: Path, library: str) -> None:
+    reader = pytest.importorskip(f"{library}.parquet" if library == "pyarrow" else library)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(MIXED, "my_msgs/msg/Mixed"))
+    point, mixed = store.types["geometry_msgs/msg/Point"], store.types["my_msgs/msg/Mixed"]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("my_msgs/msg/Mixed", "ros2msg", MIXED.encode())
+        channel = writer.register_channel("/a/b", "cdr", schema)
+        for i in range(3):
+            points = [point(1.0, 2.0, float(i))] * i
+            sent = mixed(0.1 * i, "ä" * i, i == 1, 2**60 + i, np.array([i, -1], np.float32), points)
+            payload = bytes(store.serialize_cdr(sent, "my_msgs/msg/Mixed"))
+            writer.add_message(channel, 10**18 + i, payload, 10**18)
+        writer.finish()  # type: ignore[no-untyped-call]
+    (path,) = export_parquet(read_bag(tmp_path / "a.mcap"), tmp_path / "tables")
+    table = reader.read_table(path) if library == "pyarrow" else reader.read_parquet(path)
+    names = table.column_names if library == "pyarrow" else list(table.columns)
+
+    def column(name: str) -> list[Any]:
+        values: list[Any] = table[name].to_pylist() if library == "pyarrow" else table[name].to_list()
+        return values
+
+    assert path.name == "a.b.parquet"
+    assert names == [
+        "log_time_ns", "publish_time_ns", "angle", "name", "ok", "whole", "pair[0]", "pair[1]", "len(points)",
+        "points.x[0]", "points.x[1]", "points.y[0]", "points.y[1]", "points.z[0]", "points.z[1]",
+    ]  # fmt: skip
+    assert column("log_time_ns") == [10**18, 10**18 + 1, 10**18 + 2]
+    assert column("angle") == [0.0, 0.1, 0.2]
+    assert column("name") == ["", "ä", "ää"]
+    assert [bool(value) for value in column("ok")] == [False, True, False]
+    assert column("whole") == [2**60, 2**60 + 1, 2**60 + 2]
+    assert column("pair[0]") == [0.0, 1.0, 2.0]
+    assert column("len(points)") == [0, 1, 2]
+    assert np.array_equal(column("points.z[1]"), [np.nan, np.nan, 2.0], equal_nan=True)
+    about = pytest.importorskip("pyarrow.parquet").read_schema(path)
+    assert about.field("angle").metadata == {b"unit": b"rad", b"meaning": b"which way [rad]"}
