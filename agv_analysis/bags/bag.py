@@ -267,6 +267,10 @@ class _Reading:
             self._table(storage, channel, None)
         for topic in self._borrowed.keys() & self._tables.keys():
             self._doubt(topic, self._tables[topic])
+        for topic, table in list(self._tables.items()):
+            if isinstance(table, JsonTable) and len(table.strange_times):
+                self._undecoded.setdefault(topic, []).append(table.strange_times)
+                self._refuse(topic, UndecodableError(table.first_misfit))
         arrays: dict[str, NDArray[np.void]] = {}
         for topic, table in sorted(self._tables.items()):
             try:

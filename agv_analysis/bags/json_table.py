@@ -80,6 +80,7 @@ class JsonTable:
         self.misfits = 0
         """Messages that are no JSON objects."""
         self.first_misfit = ""
+        self._misfit_times: list[int] = []
 
     is_orderly = False
     """Times are looked at when all messages are there."""
@@ -95,6 +96,7 @@ class JsonTable:
                     raise ValueError(f"a {type(content).__name__} where an object is expected")
             except (ValueError, RecursionError) as error:
                 self.misfits += 1
+                self._misfit_times.append(time[0])
                 self.first_misfit = self.first_misfit or f"no JSON object: {error}"
                 continue
             self._add(content, "", (), 0)
@@ -122,6 +124,11 @@ class JsonTable:
         if len(self._columns) > _MAX_COLUMNS:
             raise UndecodableError(f"its messages have more than {_MAX_COLUMNS} values by name")
         column.values.append((len(self._times), index, value))
+
+    @property
+    def strange_times(self) -> NDArray[np.int64]:
+        """Log times [ns] of the messages, if none of them is an object, as with lists of numbers; else empty."""
+        return np.array([] if self._times else self._misfit_times, np.int64)
 
     @property
     def rows(self) -> NDArray[np.void]:

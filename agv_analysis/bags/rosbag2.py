@@ -64,11 +64,15 @@ class Contents:
     def compare(self, topics: Mapping[str, _Found], findings: Findings) -> None:
         """Report where metadata.yaml and the files, in which these topics were found, disagree."""
         renamed = self._renamed(topics)
+        for listed, there in renamed:
+            few = "topic" if len(listed) == 1 else "topics"
+            findings.add(f"{', '.join(there)}: {few} that {METADATA} calls {', '.join(listed)}", len(listed))
+        accounted = {topic for listed, _ in renamed for topic in listed}
         for topic, expected in self.counts.items():
-            found = topics.get(renamed.get(topic, topic))
+            found = topics.get(topic)
             count = found.count if found else 0
-            if topic in renamed:
-                findings.add(f"{renamed[topic]}: topic that {METADATA} calls {topic}")
+            if topic in accounted:
+                continue
             if count < expected:
                 what = f"{topic}: message that {METADATA} counts and that is not there"
                 findings.add(what, expected - count, is_loss=True)
@@ -77,18 +81,23 @@ class Contents:
             if found and found.type and self.types.get(topic) not in ("", found.type):
                 findings.add(f"{topic}: topic of type {found.type} that {METADATA} calls {self.types.get(topic)}")
 
-    def _renamed(self, topics: Mapping[str, _Found]) -> dict[str, str]:
-        """Topics of metadata.yaml that are not in the bag, with those of equal type and count that are not in it."""
-        found: dict[str, str] = {}
-        for topic in self.counts.keys() - topics.keys():
-            twins = [
-                name
-                for name, other in topics.items()
-                if (other.count, other.type or self.types[topic]) == (self.counts[topic], self.types[topic])
-                and name not in self.counts
-            ]
-            if len(twins) == 1 and twins[0] not in found.values():
-                found[topic] = twins[0]
+    def _renamed(self, topics: Mapping[str, _Found]) -> list[tuple[list[str], list[str]]]:
+        """Topics of metadata.yaml that are not in the bag, with those of equal type and count that are not in it.
+
+        Several that are equal in this are together: which is which nobody can tell, but none is missing.
+        """
+        strange = {name: found for name, found in topics.items() if name not in self.counts}
+        groups: dict[tuple[str, int], list[str]] = {}
+        for topic in sorted(self.counts.keys() - topics.keys()):
+            groups.setdefault((self.types[topic], self.counts[topic]), []).append(topic)
+        found: list[tuple[list[str], list[str]]] = []
+        for (kind, count), listed in groups.items():
+            there = sorted(
+                name for name, other in strange.items() if (other.type or kind, other.count) == (kind, count)
+            )
+            if len(there) == len(listed):
+                found.append((listed, there))
+                strange = {name: other for name, other in strange.items() if name not in there}
         return found
 
 

@@ -294,3 +294,8 @@ def make_database() -> Callable[..., Path]:
 @pytest.fixture
 def make_mcap() -> Callable[..., Path]:
     return write_mcap
+
+
+@pytest.fixture
+def make_metadata() -> Callable[..., str]:
+    return metadata_yaml

@@ -544,6 +544,15 @@ def test_json_that_would_give_wrong_numbers_is_refused(tmp_path: Path, contents:
     assert len(bag.payloads("/t")) == 2
 
 
+def test_a_topic_of_json_without_objects_is_no_loss(tmp_path: Path) -> None:
+    bag = read_json(tmp_path, [1, 2], 3, "four")
+    with pytest.raises(BagError, match="no JSON object: a list where an object is expected"):
+        bag["/t"]
+    assert bag.is_complete
+    assert bag.log_times("/t").tolist() == [0, 1, 2]
+    assert len(bag.payloads("/t")) == 3
+
+
 def test_json_with_one_long_list_does_not_take_all_memory(tmp_path: Path) -> None:
     bag = read_json(tmp_path, *[{"a": [0.5]}] * 3000, {"a": [0.5] * 20_000})
     with pytest.raises(BagError, match="its strings or sequences differ so much in length"):

@@ -58,6 +58,23 @@ def test_what_changes_nothing_is_not_said(odd_bag: Odd, name: str) -> None:
     assert bag.topics["/point"].offered_qos == "- depth: 1"
 
 
+def test_several_renamed_topics_that_look_alike_are_no_loss(
+    tmp_path: Path, make_database: Callable[..., Path], make_metadata: Callable[..., str]
+) -> None:
+    rows = [(topic, "geometry_msgs/msg/Point", 1 + i, b"\0\1\0\0" + bytes(24)) for topic in "ab" for i in range(3)]
+    (tmp_path / "bag").mkdir()
+    make_database(tmp_path / "bag" / "bag_0.db3", part=rows)
+    topics = {"/old_a": ("geometry_msgs/msg/Point", 3), "/old_b": ("geometry_msgs/msg/Point", 3)}
+    (tmp_path / "bag" / "metadata.yaml").write_text(make_metadata(["bag_0.db3"], topics))
+    bag = read_bag(tmp_path / "bag")
+    assert "a, b: topics that metadata.yaml calls /old_a, /old_b: 2" in bag.problems
+    assert bag.is_complete
+    (tmp_path / "bag" / "metadata.yaml").write_text(
+        make_metadata(["bag_0.db3"], {**topics, "/old_c": topics["/old_a"]})
+    )
+    assert not read_bag(tmp_path / "bag").is_complete
+
+
 def test_a_hole_in_a_split_is_a_loss(odd_bag: Odd) -> None:
     bag = read_bag(odd_bag("split with a hole"))
     assert "x_1.db3 missing from the files of a split bag: 1" in bag.problems

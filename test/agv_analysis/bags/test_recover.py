@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
@@ -106,7 +107,8 @@ def records_of(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 def with_foreign(path: Path, make_record: Callable[[int, bytes], bytes]) -> list[tuple[int, bytes]]:
     """Put records of private and unknown kinds into a file: before, in and after chunks, and into the summary."""
-    data, position, parts = path.read_bytes(), 8, []
+    data, position = path.read_bytes(), 8
+    parts: list[bytes] = []
     put: list[tuple[int, bytes]] = []
 
     def new(opcode: int) -> bytes:
@@ -158,3 +160,51 @@ def test_records_of_private_and_unknown_kinds_are_copied_byte_by_byte(
     assert {problem.split(",")[0] for problem in copy.problems} == {
         f"record of the {'private' if opcode >= 0x80 else 'unknown'} kind {opcode}" for opcode, _ in put
     }
+
+
+def test_metadata_and_attachments_that_a_writer_put_into_chunks_are_not_lost(
+    tmp_path: Path, make_mcap: Callable[..., Path], make_record: Callable[[int, bytes], bytes]
+) -> None:
+    """MCAP does not allow it; nothing of it may be lost all the same."""
+    path = make_mcap(tmp_path / "a.mcap", compression=CompressionType.NONE)
+    data, position = path.read_bytes(), 8
+    parts: list[bytes] = []
+    inner_metadata = make_record(12, b"\5\0\0\0inner" + b"\x0a\0\0\0" + b"\1\0\0\0k\1\0\0\0v")
+    about = bytes(16) + b"\1\0\0\0f" + b"\1\0\0\0t" + (3).to_bytes(8, "little") + b"abc"
+    inner_file = make_record(9, about + bytes(4))
+    while position < len(data) - 8:
+        opcode, length = struct.unpack_from("<BQ", data, position)
+        whole = data[position : position + 9 + length]
+        if opcode == 6 and not any(part[0] == 6 for part in parts):
+            inner = whole[49:] + inner_metadata + inner_file
+            head = whole[9:25] + struct.pack("<QI", len(inner), zlib.crc32(inner)) + bytes(4)
+            whole = make_record(6, head + struct.pack("<Q", len(inner)) + inner)
+        parts.append(make_record(2, bytes(20)) if opcode == 2 else whole)
+        position += 9 + length
+    path.write_bytes(data[:8] + b"".join(parts) + data[-8:])
+    assert read_bag(path).metadata["inner"] == {"k": "v"}
+    recover(path, tmp_path / "out.mcap")
+    with (tmp_path / "out.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert sorted(m.name for m in reader.iter_metadata()) == ["inner", "notes", "notes"]
+        assert sorted(a.data for a in reader.iter_attachments()) == [b"abc", b"\x89PNG" + bytes(50)]
+
+
+@pytest.mark.parametrize(("name", "distro"), [("sqlite3 of Foxy", ""), ("sqlite3 of Humble", "humble"), ("mcap", "")])
+@pytest.mark.parametrize("out", ["out", "out.mcap"])
+def test_a_recovered_bag_claims_no_other_distribution(
+    odd_bag: Callable[[str], Path], tmp_path: Path, name: str, distro: str, out: str
+) -> None:
+    """By it a definition that is missing is chosen."""
+    recover(odd_bag(name), tmp_path / out)
+    assert read_bag(tmp_path / out).distro == distro
+
+
+def test_custom_data_of_metadata_yaml_is_kept(odd_bag: Callable[[str], Path], tmp_path: Path) -> None:
+    path = odd_bag("directory of Humble")
+    about = yaml.safe_load((path / "metadata.yaml").read_text())
+    about["rosbag2_bagfile_information"]["custom_data"] = {"driver": "Ada", "lap": "7"}
+    (path / "metadata.yaml").write_text(yaml.safe_dump(about))
+    recover(path, tmp_path / "out")
+    copied = yaml.safe_load((tmp_path / "out" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert copied["custom_data"] == {"driver": "Ada", "lap": "7"}
