@@ -39,8 +39,11 @@ class Batch:
 
     def after(self, first: int, count: int | None = None) -> Batch:
         """The messages from `first` on, `count` at most."""
-        part = slice(first, None if count is None else first + count)
-        return Batch(self.buffer, self.starts[part], self.sizes[part])
+        return self.at(slice(first, None if count is None else first + count))
+
+    def at(self, places: slice | Ints) -> Batch:
+        """The messages at some places."""
+        return Batch(self.buffer, self.starts[places], self.sizes[places])
 
     @property
     def log_times(self) -> Ints:

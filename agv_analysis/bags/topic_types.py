@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from agv_analysis.bags.bag_errors import UndecodableError
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.known_types import UNDEFINED, Definition, KnownTypes, no_definition
@@ -55,9 +57,14 @@ class TopicTypes:
         candidates = self._candidates(storage, channel)
         if not self._is_open(candidates) and (not candidates[0].source or _describes(candidates[0], batch.after(0, 1))):
             return candidates[0]
+        if candidates[0].is_guess and not _describes(candidates[0], batch):
+            raise UndecodableError(no_definition())
         key = _key(channel, candidates)
         if key not in self._held:
             self._hold(key)
+        if key not in self._held:  # the bag describes this channel in several ways
+            self._held[key] = _Held(candidates)
+            self._held[key].take(batch)
         return self._held[key].chosen()
 
     def _candidates(self, storage: Storage, channel: Channel) -> list[Definition]:
@@ -75,17 +82,19 @@ class TopicTypes:
         """Read all messages of topics that are open, and of the one that is wanted."""
         found: dict[_Key, _Held] = {}
         for storage in open_files(Contents(self._contents.files)):
-            asked: dict[int, list[Definition]] = {}
+            asked: dict[int, tuple[Channel, list[Definition]]] = {}
 
             def is_asked(
-                channel: Channel, storage: Storage = storage, asked: dict[int, list[Definition]] = asked
+                channel: Channel, storage: Storage = storage, asked: dict[int, tuple[Channel, list[Definition]]] = asked
             ) -> bool:
-                if channel.id not in asked:
-                    asked[channel.id] = self._asked(storage, channel, wanted)
-                return bool(asked[channel.id])
+                if channel.id not in asked or asked[channel.id][0] is not channel:
+                    asked[channel.id] = channel, self._asked(storage, channel, wanted)
+                return bool(asked[channel.id][1])
 
             for channel, batch in inflated_batches(storage, is_asked, Findings()):
-                candidates = asked[channel.id]
+                candidates = asked[channel.id][1]
+                if not candidates:  # the bag has described the channel anew meanwhile
+                    continue
                 key = _key(channel, candidates)
                 if key not in found:
                     found[key] = _Held(candidates)
@@ -130,7 +139,8 @@ class _Held:
         self._count += len(batch)
         for number, (candidate, layouts) in enumerate(zip(self._candidates, self._layouts, strict=True)):
             if candidate.is_guess:
-                self.misfits[number] += sum(not _is_memberless(payload) for payload in batch.payloads())
+                short = batch.at(np.flatnonzero(batch.sizes <= LEAD + _MEMBERLESS))
+                self.misfits[number] += len(batch) - sum(map(_is_memberless, short.payloads()))
                 continue
             before = layouts.misfits
             try:
