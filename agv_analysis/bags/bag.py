@@ -203,7 +203,7 @@ class _Reading:
         """Take over what is known of a file after its last message."""
         for number, channel in storage.channels.items():
             self._counts[channel.topic] += storage.counts[number]
-            self._known.setdefault(channel.topic, (channel, storage.schemas.get(channel.schema_id)))
+            self._known.setdefault(channel.topic, (channel, self._types.named(storage, channel)))
             if self.is_wanted(channel):
                 self._silent.setdefault(channel.topic, (storage, channel))
         self._metadata.update(storage.metadata)

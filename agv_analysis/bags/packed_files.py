@@ -74,7 +74,7 @@ def is_packed(begin: bytes) -> bool:
 def unpack(path: Path, target: Path) -> str:
     """Inflate a file, as far as it goes, to `target`; returns what ended that before its end, empty if nothing did.
 
-    Raises BagError if it cannot be read or written, or inflates to far more than any recording does.
+    Raises BagError if it cannot be read or written, is an archive, or inflates to far more than any recording does.
     """
     import zstandard
 
@@ -86,6 +86,8 @@ def unpack(path: Path, target: Path) -> str:
             packed.seek(0)
             read = next(reader for magic, reader in _READERS.items() if begin.startswith(magic))(packed)
             while written <= most and (piece := read(_PIECE)):
+                if not written:
+                    refuse_archive(piece, path)
                 written += file.write(piece)
             if begin.startswith(MAGICS["zstd"]) and written < (declared_size("zstd", begin) or 0):
                 damage = "it ends before what it declares"  # the only one whose library does not say so
@@ -109,13 +111,9 @@ def unpack(path: Path, target: Path) -> str:
     return damage
 
 
-def archive_command(path: Path, given: Path) -> str | None:
-    """The command that unpacks an archive of several files, None if `path` is none.
-
-    `given`: the archive itself, where `path` is what was inflated of it.
-    """
-    with path.open("rb") as file:
-        begin = file.read(_TAR_MAGIC_AT + len(_TAR_MAGIC))
-    if begin[_TAR_MAGIC_AT:] == _TAR_MAGIC:
-        return f"tar xf {given}"
-    return next((f"{command} {given}" for magic, command in _ARCHIVES.items() if begin.startswith(magic)), None)
+def refuse_archive(begin: bytes, path: Path) -> None:
+    """Raise BagError if a file begins, once inflated, as an archive of several files does."""
+    is_tar = begin[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC)
+    command = "tar xf" if is_tar else next((name for magic, name in _ARCHIVES.items() if begin.startswith(magic)), None)
+    if command is not None:
+        raise BagError(f"{path}: is an archive: `{command} {path}` unpacks it, then name the bag in it")

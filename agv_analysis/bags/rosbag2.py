@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from agv_analysis.bags.bag_errors import BagError
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.mcap_file import McapFile
-from agv_analysis.bags.packed_files import archive_command, is_packed, unpack
+from agv_analysis.bags.packed_files import is_packed, refuse_archive, unpack
 from agv_analysis.bags.records import MAGIC as MCAP
 from agv_analysis.bags.storage import Storage
 
@@ -153,7 +153,7 @@ def open_files(contents: Contents, keep_all: bool = False) -> Iterator[Storage]:
                     if damage := unpack(path, file):
                         what = f"{path.name}: compressed file that is damaged, read up to there ({damage})"
                         contents.findings.add(what, is_loss=True)
-                storage = _open(file, keep_all, path)
+                storage = _open(file, keep_all)
             except BagError as error:
                 error = BagError(str(error).replace(str(file), str(path)))  # where it lies, not where it was unpacked
                 if len(contents.files) == 1:
@@ -167,16 +167,14 @@ def open_files(contents: Contents, keep_all: bool = False) -> Iterator[Storage]:
 def _beginning(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(16)
+            return file.read(512)
     except OSError as error:
         raise BagError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _open(path: Path, keep_all: bool, given: Path) -> Storage:
-    """Open a file; `given`: as it was before it was unpacked."""
+def _open(path: Path, keep_all: bool) -> Storage:
     begin = _beginning(path)
-    if (unpacking := archive_command(path, given)) is not None:
-        raise BagError(f"{given}: is an archive: `{unpacking}` unpacks it, then name the bag in it")
+    refuse_archive(begin, path)
     if begin.startswith(b"#ROSBAG V"):
         raise BagError(f"{path}: is a ROS 1 bag; {_convert(path)}")
     if begin.startswith(SQLITE) or (path.suffix.lower() == ".db3" and begin):
