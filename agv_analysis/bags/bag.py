@@ -135,7 +135,7 @@ def read_bag(
     progress: Progress | None = None,
     definitions: Path | str | None = None,
 ) -> Bag:
-    """Read a rosbag2 directory, split or not, with metadata.yaml or without, or a bare .mcap or .db3 file.
+    """Read a rosbag2 directory, split or not, with metadata.yaml or without, or a .mcap or .db3 file, packed or not.
 
     `topics`: those that are wanted as arrays, None for all; an empty collection reads what the bag holds and checks it.
     `definitions`: a folder with .msg, .idl or .srv files of types that the bag does not define.

@@ -112,6 +112,14 @@ def locate(path: Path) -> Contents:
     return _bag_of_file(path)
 
 
+def looks_like_bag(path: Path, begin: bytes) -> bool:
+    """May this be a bag, by what a directory holds, or by a file's first bytes and, if it is compressed, its name?"""
+    if path.is_dir():
+        return (path / METADATA).exists() or bool(_files_in(path))
+    is_named = Path(_unpacked_name(path.name)).suffix.lower() in _STORAGES
+    return begin.startswith((MCAP[:5], SQLITE)) or (is_packed(begin) and is_named)
+
+
 def _directory(path: Path) -> Contents:
     if (path / METADATA).exists():
         return _by_metadata(path)

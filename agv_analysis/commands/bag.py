@@ -22,7 +22,7 @@ _LONG = 2**28
 def command() -> None:
     """Inspect a recording, export it, or recover the intact messages of a damaged one.
 
-    A BAG is a rosbag2 directory or a bare .mcap or .db3 file.
+    A BAG is a rosbag2 directory or a bare .mcap or .db3 file, compressed or not.
     """
 
 

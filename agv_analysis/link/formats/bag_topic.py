@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag, read_bag
 from agv_analysis.bags.bag_errors import BagError
+from agv_analysis.bags.rosbag2 import looks_like_bag
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.measurement import (
     LOST,
@@ -35,9 +36,7 @@ _MOST = 100_000_000
 
 
 def _matches(head: bytes, path: Path) -> bool:
-    if path.is_dir():
-        return (path / "metadata.yaml").exists() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
-    return head[:5] == b"\x89MCAP" or head[:15] == b"SQLite format 3"
+    return looks_like_bag(path, head)
 
 
 def _read(path: Path, options: Options) -> Measurement:

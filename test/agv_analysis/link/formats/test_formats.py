@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from agv_analysis.link.formats import FORMATS, format_of, read_link
 from agv_analysis.link.formats.format import Options
@@ -444,3 +445,16 @@ def test_a_topic_of_a_bag_is_a_link() -> None:
     assert of_slots.uplink.lost[last:].all()
     with pytest.raises(MeasurementError, match="has no topic nowhere; it has"):
         read_link(sample, Options(topic="nowhere"))
+
+
+@pytest.mark.parametrize("name", ["a.mcap.zst", "folder"])
+def test_a_bag_is_one_however_it_was_compressed(tmp_path: Path, name: str) -> None:
+    sample = Path(__file__).parents[4] / "bags/sample"
+    packed = zstandard.compress((sample / "sample_0.mcap").read_bytes())
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "a.mcap.zst", tmp_path / "folder" / "a_0.mcap.zstd"):
+        path.write_bytes(packed)
+    found, plain = measured(tmp_path / name).uplink, measured(sample).uplink
+    assert found is not None
+    assert plain is not None
+    assert found.lost.tolist() == plain.lost.tolist()
