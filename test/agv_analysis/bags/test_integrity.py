@@ -25,7 +25,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from agv_analysis.bags import Bag, BagError, message_compression, read_bag, rosbag2, storage
+from agv_analysis.bags import Bag, BagError, message_compression, packed_files, read_bag, storage
 from agv_analysis.bags.chunk import sort_out, walk
 from agv_analysis.bags.recover import recover
 
@@ -659,7 +659,7 @@ def test_flipped_bits_in_a_compressed_file(tmp_path: Path) -> None:
 
 
 def test_a_bomb_as_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rosbag2, "_ALWAYS_UNPACKED", 2**20)
+    monkeypatch.setattr(packed_files, "_ALWAYS_UNPACKED", 2**20)
     file = packed(tmp_path / "bag")
     assert len(rows_of(read_bag(file.parent))) == len(_messages())
     file.write_bytes(zstandard.ZstdCompressor().compress(bytes(2**28)))
