@@ -13,6 +13,7 @@ import types
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from agv_ros.parameters import forget_parameters
 from agv_ros.parts import Call, Part, PartError, in_one_line, part_of, shortened
@@ -163,6 +164,12 @@ def own_parts(package: str, first: str, besides: Collection[str], name: str = ""
 def installed(group: str) -> dict[str, tuple[EntryPoint, ...]]:
     """Entry points of a group by name; more than one where packages chose the same name."""
     found: dict[str, tuple[EntryPoint, ...]] = {}
-    for point in sorted(set(entry_points(group=group)), key=lambda point: (point.name, point.value)):
+    for point in sorted(set(_entry_points().select(group=group)), key=lambda point: (point.name, point.value)):
         found[point.name] = (*found.get(point.name, ()), point)
     return found
+
+
+@functools.cache
+def _entry_points() -> Any:
+    """Those of all groups, for which the files of all installed packages are read: once for all registries."""
+    return entry_points()
