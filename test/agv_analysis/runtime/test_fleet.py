@@ -26,6 +26,7 @@ from agv_ros.parameters import ParameterError
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
+    from test.agv_analysis.runtime.conftest import UntilSteps
     from test.conftest import Start
 
 PAPER = str(Path(__file__).parents[3] / "config/paper.yaml")
@@ -263,12 +264,12 @@ def test_what_cannot_be_driven_is_said_in_a_line(agv_ncs: AgvNcs, tmp_path: Path
 
 @pytest.mark.parametrize("how", [(), ("--processes",)], ids=["one process", "processes"])
 def test_an_interrupted_fleet_leaves_readable_bags_and_nothing_else(
-    start: Start, tmp_path: Path, how: tuple[str, ...]
+    start: Start, until_steps: UntilSteps, tmp_path: Path, how: tuple[str, ...]
 ) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     bag, names = tmp_path / "fleet", vehicle_names(2)
     run = start("agv_analysis.cli", "run", PAPER, "--fleet", "2", "--duration", "10000", "--bag", str(bag), *how)
-    run.until_recorded(*(bag / name for name in names))
+    until_steps(300, *(f"/{name}/clock" for name in names))
     children = run.children()
     assert len(children) == (2 if how else 0)
     run.process.send_signal(signal.SIGINT)

@@ -20,7 +20,6 @@ rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 
 from agv_analysis.bags.message_definitions import schema_of
 from agv_analysis.bags.writer import BagWriter, TopicInfo
@@ -33,6 +32,7 @@ from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.node import LOOP_QOS
 
 if TYPE_CHECKING:
+    from test.agv_analysis.runtime.conftest import UntilSteps
     from test.conftest import Drive, Start
 
 REPOSITORY = Path(__file__).parents[3]
@@ -105,10 +105,10 @@ def test_schemas_hold_what_rosbags_knows_of_the_types() -> None:
         ]
 
 
-def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) -> None:
+def test_an_interrupted_run_leaves_a_readable_bag(start: Start, until_steps: UntilSteps, tmp_path: Path) -> None:
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--bag", str(where))
-    run.until_recorded(where)
+    until_steps(300, "/clock")
     run.process.send_signal(signal.SIGINT)
     status, said = run.end()
     assert status == 1
@@ -119,10 +119,10 @@ def test_an_interrupted_run_leaves_a_readable_bag(start: Start, tmp_path: Path) 
     assert not recorded.unexplained
 
 
-def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, tmp_path: Path) -> None:
+def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, until_steps: UntilSteps, tmp_path: Path) -> None:
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
-    run.until_recorded(where)
+    until_steps(300, "/clock")
     run.process.send_signal(signal.SIGTERM)
     status, said = run.end()
     assert status == 1
@@ -130,26 +130,18 @@ def test_a_run_in_processes_is_interrupted_as_cleanly(start: Start, tmp_path: Pa
     assert not read_run(where).unexplained
 
 
-def test_an_interrupted_run_waits_for_a_recorder_that_lags(start: Start, tmp_path: Path) -> None:
+def test_an_interrupted_run_waits_for_a_recorder_that_lags(
+    start: Start, until_steps: UntilSteps, tmp_path: Path
+) -> None:
     """The recorder's process sleeps for some hundred steps, as on a busy machine: all of them are in the bag."""
     where = tmp_path / "bag"
     run = start("agv_analysis.cli", "run", "config/outages.yaml", "--processes", "--bag", str(where))
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    executor = EXECUTORS["single"](context=context)
-    listener = rclpy.create_node("listener", context=context, use_global_arguments=False)
-    seen: list[Clock] = []
-    listener.create_subscription(Clock, "/clock", seen.append, LOOP_QOS)
-    executor.add_node(listener)
-    assert spin_for(executor, lambda: len(seen) > 20, 60.0)
+    until_steps(20, "/clock")
     recorder = next(child for child in run.children() if "recorder_node" in (child / "cmdline").read_text())
     os.kill(int(recorder.name), signal.SIGSTOP)
-    begun = len(seen)
-    assert spin_for(executor, lambda: len(seen) > begun + 300, 60.0)
+    until_steps(300, "/clock")
     run.process.send_signal(signal.SIGTERM)
     os.kill(int(recorder.name), signal.SIGCONT)
-    listener.destroy_node()
-    context.try_shutdown()
     _, said = run.end()
     assert "everything that was published" in said
     assert len(read_run(where)) > 300

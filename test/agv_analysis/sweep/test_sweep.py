@@ -404,8 +404,8 @@ def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(
     tmp_path: Path, start: Callable[..., Any], agv_ncs: Callable[..., tuple[int, str]]
 ) -> None:
     arguments = (
-        "sweep", PAPER, *(f"--set={setting}" for setting in BERNOULLI[:2]), "--vary=controller.kx=5:60:40",
-        "--seeds=48", "--workers=1", "--no-verdicts", "--out",
+        "sweep", PAPER, *(f"--set={setting}" for setting in (*BERNOULLI[:2], "plant.duration=25.0")),
+        "--vary=controller.kx=5:60:40", "--seeds=96", "--workers=1", "--no-verdicts", "--out",
     )  # fmt: skip
     started = start("agv_analysis.cli", *map(str, (*arguments, tmp_path / "stopped")))
     started.until(lambda: any((tmp_path / "stopped").glob("parts/*.npy")))
