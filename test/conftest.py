@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import re
 import shutil
@@ -17,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import hypothesis
 import pytest
+
+from test.command_runner import run_command
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
@@ -140,10 +143,6 @@ class Started:
                 self.process.wait(0.05)
                 pytest.fail("ended too early:\n" + self.end()[1])
 
-    def until_recorded(self, *bags: Path) -> None:
-        """Wait until there are some hundred steps in each of the bags that it writes."""
-        self.until(lambda: all(any(file.stat().st_size > 100_000 for file in bag.glob("*.mcap")) for bag in bags))
-
     def children(self) -> list[Path]:
         """The processes that it has begun, from whichever thread, and that still run: their folders in Linux' /proc."""
         found: list[str] = []
@@ -213,10 +212,32 @@ def without_ros() -> Code:
     return run
 
 
+AgvNcs = Callable[..., tuple[int, str]]
+
+
 @pytest.fixture
-def agv_ncs(start: Start) -> Callable[..., tuple[int, str]]:
-    """Run a command of `agv-ncs` to its end: exit status and output."""
-    return lambda *arguments, **options: start("agv_analysis.cli", *map(str, arguments), **options).end(300.0)
+def agv_ncs(start: Start, monkeypatch: pytest.MonkeyPatch) -> AgvNcs:
+    """Run a command of `agv-ncs` to its end: exit status and output.
+
+    It runs in this process; with an environment `env` in one that has it, which a test's other commands share.
+    """
+    others: list[tuple[dict[str, str], Started]] = []
+
+    def run(*arguments: object, env: dict[str, str] | None = None) -> tuple[int, str]:
+        words = list(map(str, arguments))
+        if env is None:
+            monkeypatch.chdir(REPOSITORY)
+            return run_command(words)
+        other = next((started for known, started in others if known == env), None)
+        if other is None:
+            other = start(sys.executable, "test/command_runner.py", env=env, stdin=subprocess.PIPE)
+            others.append((dict(env), other))
+        assert other.process.stdin is not None
+        print(json.dumps(words), file=other.process.stdin, flush=True)
+        status, said = json.loads(other.wait_for("done: ").partition("done: ")[2])
+        return status, said
+
+    return run
 
 
 Install = Callable[..., dict[str, str]]

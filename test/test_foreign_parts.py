@@ -24,7 +24,7 @@ from agv_plant.random_stream import uniforms
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from test.conftest import Install, Start
+    from test.conftest import AgvNcs, Install, Start
 
 REPOSITORY = Path(__file__).parents[1]
 PAPER = "config/paper.yaml"
@@ -142,8 +142,16 @@ def python(environment: dict[str, str], *arguments: str) -> str:
     return done.stdout
 
 
-def cli(environment: dict[str, str], *arguments: str | Path) -> str:
-    return python(environment, "-m", "agv_analysis.cli", *map(str, arguments))
+@pytest.fixture
+def cli(package: dict[str, str], agv_ncs: AgvNcs) -> Callable[..., str]:
+    """Output of a command where the package is installed; it must succeed."""
+
+    def run(*arguments: str | Path) -> str:
+        status, said = agv_ncs(*arguments, env=package)
+        assert status == 0, said
+        return said
+
+    return run
 
 
 READ = """
@@ -178,35 +186,35 @@ def assert_same(found: NDArray[np.float64], given: Given) -> None:
 
 @pytest.mark.parametrize("given", [ALL, AHEAD], ids=["law, vehicle, policy, channel", "look-ahead"])
 def test_nodes_simulation_and_recording_do_what_is_written_here(
-    package: dict[str, str], tmp_path: Path, given: Given
+    package: dict[str, str], cli: Callable[..., str], tmp_path: Path, given: Given
 ) -> None:
     bag, recorded, simulated = tmp_path / "bag", tmp_path / "recorded.npy", tmp_path / "simulated.npy"
-    cli(package, "run", PAPER, *given.options, "--bag", bag)
+    cli("run", PAPER, *given.options, "--bag", bag)
     python(package, "-c", READ, str(bag), str(recorded))
     assert_same(np.load(recorded), given)
     python(package, "-c", SIMULATE, PAPER, str(simulated), *given.settings)
     assert_same(np.load(simulated), given)
-    assert cli(package, "replay", bag, "--compare").count("equal (largest difference") == 2
+    assert cli("replay", bag, "--compare").count("equal (largest difference") == 2
 
 
-def test_a_recording_is_judged(package: dict[str, str], tmp_path: Path) -> None:
+def test_a_recording_is_judged(cli: Callable[..., str], tmp_path: Path) -> None:
     bag, short = tmp_path / "bag", ("--set", "plant.duration=0.5")
-    cli(package, "run", PAPER, *AHEAD.options, *short, "--bag", bag)
-    assert "Verdict" in cli(package, "analyse", bag, "--json", tmp_path / "found.json")
+    cli("run", PAPER, *AHEAD.options, *short, "--bag", bag)
+    assert "Verdict" in cli("analyse", bag, "--json", tmp_path / "found.json")
     found = json.loads((tmp_path / "found.json").read_text())
     assert (found["steps"], found["unexplained"]) == (100, {})
     assert found["verdict"] is not None
-    assert "Verdict" in cli(package, "simulate", PAPER, *AHEAD.options, *short)
+    assert "Verdict" in cli("simulate", PAPER, *AHEAD.options, *short)
 
 
 def test_the_loop_in_processes_and_a_replay_on_dds_have_the_policy_s_commands(
-    package: dict[str, str], tmp_path: Path
+    package: dict[str, str], cli: Callable[..., str], tmp_path: Path
 ) -> None:
     bag, rows = tmp_path / "bag", tmp_path / "rows.npy"
-    cli(package, "run", PAPER, *ALL.options, "--processes", "--bag", bag)
+    cli("run", PAPER, *ALL.options, "--processes", "--bag", bag)
     python(package, "-c", READ, str(bag), str(rows))
     assert_same(np.load(rows), ALL)
-    assert cli(package, "replay", bag, "--lockstep", "--compare").count("equal (largest difference") == 2
+    assert cli("replay", bag, "--lockstep", "--compare").count("equal (largest difference") == 2
 
 
 def test_late_messages_go_another_way_through_the_simulation_to_the_same_numbers(
@@ -251,9 +259,9 @@ def test_numba_changes_nothing(package: dict[str, str], tmp_path: Path) -> None:
     assert python(package, "-c", without, PAPER, *short) == compiled
 
 
-def test_a_gain_of_it_can_be_swept(package: dict[str, str], tmp_path: Path) -> None:
+def test_a_gain_of_it_can_be_swept(cli: Callable[..., str], tmp_path: Path) -> None:
     cli(
-        package, "sweep", PAPER, *ALL.options, "--vary", "controller.integral.ki=0:8:3", "--seeds", "2",
+        "sweep", PAPER, *ALL.options, "--vary", "controller.integral.ki=0:8:3", "--seeds", "2",
         "--no-verdicts", "--out", tmp_path / "sweep",
     )  # fmt: skip
     points = np.genfromtxt(tmp_path / "sweep/points.csv", delimiter=",", names=True)
@@ -261,14 +269,14 @@ def test_a_gain_of_it_can_be_swept(package: dict[str, str], tmp_path: Path) -> N
     assert points["runs"].tolist() == [2, 2, 2]
     assert len(set(points["iae_p50"].tolist())) == 3
     said = cli(
-        package, "sweep", PAPER, "--set", "plant.duration=1.0", "--vary", "controller.law=kanayama,integral",
+        "sweep", PAPER, "--set", "plant.duration=1.0", "--vary", "controller.law=kanayama,integral",
         "--out", tmp_path / "laws",
     )  # fmt: skip
     assert "integral" in said
 
 
-def test_its_parameters_are_listed_with_unit_bounds_and_meaning(package: dict[str, str]) -> None:
-    said = cli(package, "parameters")
+def test_its_parameters_are_listed_with_unit_bounds_and_meaning(cli: Callable[..., str]) -> None:
+    said = cli("parameters")
     for name, unit, default, bounds, meaning in (
         ("integral.ki", "1/s^2", "4.0", "in [0, 1000]", "gain of the integral of the error along the track"),
         ("aim.k", "1/s", "1.5", "in [0, 100]", "gain of the distance to the point ahead"),
@@ -325,11 +333,11 @@ def test_a_params_file_holds_the_parameters_of_the_parts_chosen(package: dict[st
 
 
 def test_a_bag_is_read_in_part_where_the_package_is_missing(
-    package: dict[str, str], tmp_path: Path, agv_ncs: Callable[..., tuple[int, str]]
+    cli: Callable[..., str], tmp_path: Path, agv_ncs: Callable[..., tuple[int, str]]
 ) -> None:
     bag = tmp_path / "bag"
     short = ("--set", "plant.duration=0.5", "--bag", bag)
-    cli(package, "run", PAPER, *AHEAD.options, *short)
+    cli("run", PAPER, *AHEAD.options, *short)
     status, said = agv_ncs("analyse", bag)
     assert status == 1
     assert "Traceback" not in said

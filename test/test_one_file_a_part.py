@@ -11,10 +11,16 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from test.conftest import AgvNcs
+
+Command = Callable[..., str]
 
 REPOSITORY = Path(__file__).parents[1]
 SOURCES = ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs")
@@ -129,33 +135,43 @@ def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def environment_of(folder: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"}
+
+
 def python(folder: Path, *arguments: str) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(folder), "COLUMNS": "200"}
     done = subprocess.run(
-        [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
-    )
+        [sys.executable, *arguments],
+        cwd=folder, env=environment_of(folder), capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def agv_ncs(folder: Path, *arguments: str) -> str:
-    return python(folder, "-m", "agv_analysis.cli", *arguments)
+@pytest.fixture
+def command(copied: Path, agv_ncs: AgvNcs) -> Command:
+    """Output of a command with the copy as it is when the test's first one is run; it must succeed."""
+
+    def run(*arguments: str) -> str:
+        status, said = agv_ncs(*arguments, env=environment_of(copied))
+        assert status == 0, said
+        return said
+
+    return run
 
 
 @pytest.mark.no_cover
 @pytest.mark.parametrize("kind", PARTS)
-def test_one_new_file_is_a_part(copied: Path, kind: str, tmp_path: Path) -> None:
+def test_one_new_file_is_a_part(copied: Path, command: Command, kind: str, tmp_path: Path) -> None:
     file, source, settings, listed = PARTS[kind]
     assert not (copied / file).exists()
     (copied / file).write_text(source)
     try:
-        assert listed in agv_ncs(copied, "parameters")
+        assert listed in command("parameters")
         chosen = [word for setting in settings for word in ("--set", setting)]
         lossy = () if kind == "channel" else ("--set", "relay.uplink.model=bernoulli", "--set", "relay.uplink.p=0.2")
         out = tmp_path / "run.json"
-        agv_ncs(
-            copied, "simulate", "config/paper.yaml", *lossy, *chosen, "--set", "plant.duration=2.0", "--json", str(out)
-        )
+        command("simulate", "config/paper.yaml", *lossy, *chosen, "--set", "plant.duration=2.0", "--json", str(out))
         found = json.loads(out.read_text())
         assert found["steps"] == 400
         assert found["loss_rate"] > 0.0
@@ -165,7 +181,7 @@ def test_one_new_file_is_a_part(copied: Path, kind: str, tmp_path: Path) -> None
 
 
 @pytest.mark.no_cover
-def test_one_new_file_is_a_criterion(copied: Path, tmp_path: Path) -> None:
+def test_one_new_file_is_a_criterion(copied: Path, command: Command, tmp_path: Path) -> None:
     """Terminal, JSON, report, explorer, sweep's border, map and margins show it."""
     file = copied / "agv_analysis/stability/criteria/walker.py"
     file.write_text(CRITERION)
@@ -173,16 +189,16 @@ def test_one_new_file_is_a_criterion(copied: Path, tmp_path: Path) -> None:
     line = ("config/paper.yaml", "--set", "error_detector.track=line")
     short = ("--set", "plant.duration=2.0")
     try:
-        said = agv_ncs(copied, "simulate", *line, *short, "--json", str(out), "--report", str(page))
+        said = command("simulate", *line, *short, "--json", str(out), "--report", str(page))
         assert "Slower than a walker" in said
         assert json.loads(out.read_text())["walker_top_speed"] == 1.0
         assert "Slower than a walker" in page.read_text()
         assert "Walker&#39;s speed" in page.read_text()
-        said = agv_ncs(copied, "stability", *line, *short, "--json", str(out))
+        said = command("stability", *line, *short, "--json", str(out))
         assert "Walker's speed" in said
         assert json.loads(out.read_text())["walker"] == {"speed": 1.6}
-        agv_ncs(
-            copied, "stability", *line, "--map", "kx,ts", "--points", "2", "--csv", str(table),
+        command(
+            "stability", *line, "--map", "kx,ts", "--points", "2", "--csv", str(table),
             "--picture", str(tmp_path / "map.png"),
         )  # fmt: skip
         assert {row["n_walker"] for row in csv.DictReader(table.open())} == {"7"}
@@ -207,7 +223,7 @@ def test_a_law_that_was_edited_is_judged_as_it_is(copied: Path, tmp_path: Path) 
     )
 
     def found(*arguments: str) -> Any:
-        agv_ncs(copied, *arguments)
+        python(copied, "-m", "agv_analysis.cli", *arguments)
         return json.loads(out.read_text())
 
     assert "+ kx * x_e" in as_it_was

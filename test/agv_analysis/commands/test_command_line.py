@@ -1,4 +1,4 @@
-"""`agv-ncs` as a person meets it: what it prints, what it writes, what it says to bad input. Real processes."""
+"""`agv-ncs` as a person meets it: what it prints, what it writes, what it says to bad input."""
 
 from __future__ import annotations
 
