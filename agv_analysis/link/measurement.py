@@ -6,7 +6,6 @@ packets were lost in each interval, and no more; a `Setting` is no measurement b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,9 +20,6 @@ RECEIVED, LOST, UNKNOWN, NOT_SENT = 0, 1, 2, 3
 would have answered was lost."""
 
 Codes = NDArray[np.int8]
-
-_SPARSE, _MOST_MISSING = 1000, 1_000_000
-"""A series of numbered packets may lack so many for each that is there, and so many more."""
 
 _SHOWN = 3
 """Malformed lines that are shown."""
@@ -166,104 +162,7 @@ class Setting:
 Reading = Measurement | LossRates | Setting
 
 
-@dataclass(frozen=True)
-class Numbered:
-    """Packets that came back, in the order in which the file has them."""
-
-    seq: NDArray[np.int64]
-    """Sequence numbers, shape (n,)."""
-    delays: tuple[Floats, ...]
-    """Delays [s] of the packets, NaN where unknown, each of shape (n,)."""
-    sent: Floats | None = None
-    """When they were sent [s], shape (n,), NaN where unknown; None: the file has no times."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """Every packet of a numbered measurement, received or not."""
-
-    sent: Floats
-    outcome: Codes
-    delays: tuple[Floats, ...]
-    duplicates: int
-    reordered: int
-
-
-def on_grid(found: Numbered, first: int, last: int, interval: float) -> Grid:
-    """All packets from number `first` to number `last`, those without a record as lost.
-
-    Times that the file does not have are interpolated by number; without any, packets are `interval` [s] apart. Raises
-    MeasurementError for numbers that can be none of a sequence.
-    """
-    count = last - first + 1
-    if count > _SPARSE * len(found.seq) + _MOST_MISSING:
-        raise MeasurementError(
-            f"numbers go from {first} to {last}, and {len(found.seq)} packets have one: these are no sequence numbers, "
-            "or one of them is broken"
-        )
-    rows = found.seq - first
-    is_known = (rows >= 0) & (rows < count)
-    record = np.full(count, -1, dtype=np.int64)
-    known = np.flatnonzero(is_known)[::-1]
-    record[rows[known]] = known  # the first record of each number counts: it is written last
-    places = np.flatnonzero(record >= 0)
-    at = record[places]
-    outcome = np.where(record >= 0, RECEIVED, LOST).astype(np.int8)
-    delays = []
-    for given in found.delays:
-        delay = np.full(count, np.nan)
-        delay[places] = given[at]
-        delays.append(delay)
-    is_first = np.zeros(len(rows), dtype=np.bool_)
-    is_first[at] = True
-    seen = rows[is_first]
-    return Grid(
-        sent=_times(found.sent, at, places, count, interval),
-        outcome=outcome,
-        delays=tuple(delays),
-        duplicates=len(known) - len(at),
-        reordered=int(np.count_nonzero(seen < np.maximum.accumulate(seen))) if len(seen) else 0,
-    )
-
-
-def _times(
-    sent: Floats | None, at: NDArray[np.int64], places: NDArray[np.int64], count: int, interval: float
-) -> Floats:
-    """When each packet was sent [s] since the first, shape (count,), increasing."""
-    if sent is None:
-        return np.arange(count, dtype=np.float64) * interval
-    stamps = sent[at]
-    known = ~np.isnan(stamps)
-    x, y = places[known], stamps[known]
-    if len(x) < 2:
-        return np.arange(count, dtype=np.float64) * interval
-    step = float(y[-1] - y[0]) / float(x[-1] - x[0])
-    times = np.interp(np.arange(count, dtype=np.float64), x, y)
-    first, last = int(x[0]), int(x[-1])
-    times[:first] = y[0] + step * np.arange(-first, 0)
-    times[last + 1 :] = y[-1] + step * np.arange(1, count - last)
-    times -= times[0]
-    # Time stamps are rounded, and a reply that is printed late dates its packet late: order is that of the numbers.
-    return np.maximum.accumulate(times, out=times)
-
-
-def unwrapped(seq: NDArray[np.int64], modulus: int = 65536) -> NDArray[np.int64]:
-    """Numbers that begin anew after `modulus` - 1, made to count on; replies out of order stay out of order."""
-    if len(seq) == 0 or int(seq.max()) >= modulus:
-        return seq
-    steps = np.diff(seq, prepend=seq[0])
-    wraps = np.flatnonzero(np.abs(steps) > modulus // 2)
-    steps[wraps] -= modulus * np.sign(steps[wraps])
-    steps[0] = seq[0]
-    return np.cumsum(steps, out=steps)
-
-
 def needs_packets(count: int, source: str, what: str) -> None:
     """Raises MeasurementError for a file without a single packet."""
     if count < 1:
         raise MeasurementError(f"{source}: has no {what}")
-
-
-def joined(parts: Sequence[Floats]) -> Floats:
-    """Parts of a column, one after the other."""
-    return np.concatenate(parts) if parts else np.zeros(0)

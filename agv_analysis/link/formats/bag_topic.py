@@ -21,10 +21,9 @@ from agv_analysis.link.measurement import (
     RECEIVED,
     Measurement,
     MeasurementError,
-    Numbered,
     PacketOutcomes,
-    on_grid,
 )
+from agv_analysis.link.packet_grid import PacketGrid
 from agv_analysis.recordings.sampling import period_of
 
 Times = NDArray[np.int64]
@@ -120,7 +119,9 @@ def measure_topic(bag: Bag, topic: str, period: float | None = None) -> Measurem
     delay = np.full(len(logged), np.nan) if stamps is None else np.asarray((logged - stamps) * _NS, dtype=np.float64)
     if stamps is not None:
         notes.append("delays are from stamp to log, and as good as the clocks of robot and recorder agree")
-    grid = on_grid(Numbered(seq, (delay,), (times - times.min()) * _NS), int(seq.min()), int(seq.max()), period * _NS)
+    packets = PacketGrid(delays=1)
+    packets.add(seq, (delay,), np.asarray((times - times.min()) * _NS, dtype=np.float64))
+    grid = packets.whole(period * _NS)
     return Measurement(
         source=f"{bag.path}:{topic}", format="bag", sent=grid.sent,
         uplink=PacketOutcomes(grid.outcome, None if stamps is None else grid.delays[0]), duplicates=grid.duplicates,

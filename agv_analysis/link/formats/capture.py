@@ -28,10 +28,9 @@ from agv_analysis.link.measurement import (
     Malformed,
     Measurement,
     MeasurementError,
-    Numbered,
     PacketOutcomes,
-    on_grid,
 )
+from agv_analysis.link.packet_grid import PacketGrid
 
 _MAGICS = (
     b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a",
@@ -154,10 +153,9 @@ def _of_one(path: Path, malformed: Malformed, options: Options) -> Measurement:
         )
     writer = _chosen(of_user, options.topic, path)
     seq, arrived = np.array(of_user[writer], dtype=np.int64), np.array(times[writer])
-    unknown = np.full(len(seq), np.nan)
-    grid = on_grid(
-        Numbered(seq, (unknown,), arrived - arrived[0]), int(seq.min()), int(seq.max()), options.interval or 1.0
-    )
+    packets = PacketGrid()
+    packets.add(seq, (), arrived - arrived[0])
+    grid = packets.whole(options.interval or 1.0)
     others = len(of_user) - 1
     notes = [
         f"samples of the writer {_name(writer)}"

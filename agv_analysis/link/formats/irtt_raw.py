@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
-from agv_analysis.link.formats.rows import rows_of_words
+from agv_analysis.link.formats.rows import parts_of_rows
 from agv_analysis.link.measurement import (
     RECEIVED,
     UNKNOWN,
     Malformed,
     Measurement,
-    Numbered,
     PacketOutcomes,
     needs_packets,
-    on_grid,
 )
+from agv_analysis.link.packet_grid import PacketGrid
 
 _COLUMNS = 7
 _WANTED = (0, 1, 2, 3, 5)
@@ -41,16 +40,14 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed = Malformed()
-    table = rows_of_words(path, _COLUMNS, malformed, options.progress, _WANTED)
-    unnumbered = np.isnan(table[:, 0])
-    malformed.count += int(np.count_nonzero(unnumbered))
-    table = table[~unnumbered]
-    needs_packets(len(table), str(path), "line of a reply")
-    again = table[:, 4] == 1.0
-    table, duplicates = table[~again], int(np.count_nonzero(again))
-    needs_packets(len(table), str(path), "reply that is no duplicate")
-    seq = table[:, 0].astype(np.int64)
+    malformed, found, duplicates = Malformed(), PacketGrid(delays=3), 0
+    for table in parts_of_rows(path, _COLUMNS, malformed, options.progress, _WANTED):
+        is_numbered, again = ~np.isnan(table[:, 0]), table[:, 4] == 1.0
+        malformed.count += int(np.count_nonzero(~is_numbered))
+        duplicates += int(np.count_nonzero(is_numbered & again))
+        table = table[is_numbered & ~again]
+        found.add(table[:, 0].astype(np.int64), tuple(1e-3 * table[:, i] for i in (3, 2, 1)))
+    needs_packets(found.records, str(path), "line of a reply" if not duplicates else "reply that is no duplicate")
     interval = options.interval or _USUAL_INTERVAL
     assumed = " between them, as --interval says" if options.interval else (
         " between them, irtt's usual, is assumed; say otherwise with --interval"
@@ -59,7 +56,7 @@ def _read(path: Path, options: Options) -> Measurement:
         f"the lines do not say when packets were sent: {interval:g} s{assumed}",
         "packets after the last reply are unknown, and on which way a packet was lost",
     ]
-    grid = on_grid(Numbered(seq, tuple(1e-3 * table[:, i] for i in (3, 2, 1))), 0, int(seq.max()), interval)
+    grid = found.whole(interval, first=0)
     up, down, rtt = grid.delays
     either = np.where(grid.outcome == RECEIVED, RECEIVED, UNKNOWN).astype(np.int8)
     directions = [PacketOutcomes(either, None if np.isnan(delay).all() else delay) for delay in (up, down)]

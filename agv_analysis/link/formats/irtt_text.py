@@ -21,11 +21,10 @@ from agv_analysis.link.measurement import (
     UNKNOWN,
     Malformed,
     Measurement,
-    Numbered,
     PacketOutcomes,
     needs_packets,
-    on_grid,
 )
+from agv_analysis.link.packet_grid import PacketGrid
 from agv_analysis.run import Floats
 
 _LINE = re.compile(rb"^seq=\d+ rtt=-?[\d.]+", re.MULTILINE)
@@ -43,21 +42,19 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed, parts, duplicates = Malformed(), list[Floats](), 0
+    malformed, found, duplicates = Malformed(), PacketGrid(delays=3), 0
     for block in blocks(path, options.progress):
         table, again = _table(block, malformed)
-        parts.append(table)
+        found.add(table[:, 0].astype(np.int64), tuple(table[:, i] for i in (1, 2, 3)))
         duplicates += again
-    found = np.concatenate(parts) if parts else np.zeros((0, 4))
-    needs_packets(len(found), str(path), "line of a reply")
-    seq = found[:, 0].astype(np.int64)
+    needs_packets(found.records, str(path), "line of a reply")
     interval = options.interval or _USUAL_INTERVAL
     assumed = "as --interval says" if options.interval else "irtt's usual, is assumed; say otherwise with --interval"
     notes = (
         f"the lines do not say when packets were sent: {interval:g} s between them, {assumed}",
         "packets after the last reply are unknown, and on which way a packet was lost",
     )
-    grid = on_grid(Numbered(seq, tuple(found[:, i] for i in (1, 2, 3))), 0, int(seq.max()), interval)
+    grid = found.whole(interval, first=0)
     rtt, up, down = grid.delays
     either = np.where(grid.outcome == RECEIVED, RECEIVED, UNKNOWN).astype(np.int8)
     directions = [PacketOutcomes(either, None if np.isnan(delay).all() else delay) for delay in (up, down)]

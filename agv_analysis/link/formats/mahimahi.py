@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
-from agv_analysis.link.formats.rows import rows_of_words
+from agv_analysis.link.formats.rows import parts_of_rows
 from agv_analysis.link.measurement import (
     RECEIVED,
     Malformed,
@@ -21,6 +21,7 @@ from agv_analysis.link.measurement import (
     PacketOutcomes,
     needs_packets,
 )
+from agv_analysis.link.packet_grid import Column
 
 _USUAL_INTERVAL = 0.005
 """Time between the packets that are asked about [s]: the usual sampling period."""
@@ -42,8 +43,10 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed = Malformed()
-    at = rows_of_words(path, 1, malformed, options.progress)[:, 0]
+    malformed, found = Malformed(), Column()
+    for rows in parts_of_rows(path, 1, malformed, options.progress):
+        found.extend(rows[:, 0])
+    at = found.values
     needs_packets(len(at), str(path), "line of an opportunity")
     if np.any(np.diff(at) < 0.0) or not at[-1] > 0.0:
         raise MeasurementError(f"{path}: times of a mahimahi trace must not decrease, and end behind 0")

@@ -2,6 +2,7 @@
 
     [1700000000.123456] 64 bytes from 10.0.0.2: icmp_seq=1 ttl=64 time=0.045 ms (DUP!)
     [1700000000.143456] no answer yet for icmp_seq=2
+    16 bytes from ::1, icmp_seq=0 hlim=64 time=0.059 ms
     From 10.0.0.1 icmp_seq=3 Destination Host Unreachable
     5 packets transmitted, 4 received, 20% packet loss, time 81ms
 
@@ -17,52 +18,45 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.text_columns import Block, Places, blocks, is_preceded_by, numbers_at
-from agv_analysis.link.measurement import (
-    Malformed,
-    Measurement,
-    MeasurementError,
-    Numbered,
-    PacketOutcomes,
-    joined,
-    on_grid,
-    unwrapped,
-)
+from agv_analysis.link.measurement import Malformed, Measurement, MeasurementError, PacketOutcomes
+from agv_analysis.link.packet_grid import CountedOn, PacketGrid
 from agv_analysis.run import Floats
 
 _USUAL_INTERVAL = 1.0
 """Time between packets that ping takes without -i [s]."""
 
-_HEADER = re.compile(rb"PING\s")
+_HEADER = re.compile(rb"PING6?[\s(]")
 _SUMMARY = re.compile(rb"(\d+) packets transmitted(?:.*?\btime (\d+) ?ms)?")
-_REPLY = re.compile(rb": (?:icmp_)?seq=\d+ ttl=\d+|no answer yet for icmp_seq=\d+")
+_REPLY = re.compile(rb"[:,] (?:icmp_)?seq=\d+ (?:ttl|hlim)=\d+|no answer yet for icmp_seq=\d+")
 _OTHER = re.compile(
-    rb"-+ .* ping statistics -+|(rtt|round-trip) .*|\^C|\d+ packets transmitted.*|pipe \d+|ping: .*|WARNING: .*"
+    rb"-+ .* ping6? statistics -+|(rtt|round-trip) .*|\^C|\d+ packets transmitted.*|pipe \d+|ping6?: .*|WARNING: .*"
     rb"|Request timeout for icmp_seq \d+|\d+/\d+ packets,.*|.*\+\d+ (duplicates|errors|corrupted).*|PATTERN: .*"
+    rb"|wrong data byte .*|#\d+\s[0-9a-f ]*"
 )
 """Lines that say nothing of a packet."""
-
-Ints = NDArray[np.int64]
 
 
 @dataclass
 class _Found:
     """What the lines of a file say, so far."""
 
-    seq: list[Ints] = field(default_factory=list)
-    """Of every line with a number, reply or not."""
-    is_reply: list[NDArray[np.bool_]] = field(default_factory=list)
-    rtt: list[Floats] = field(default_factory=list)
-    stamp: list[Floats] = field(default_factory=list)
+    grid: PacketGrid = field(default_factory=lambda: PacketGrid(delays=1))
+    numbers: CountedOn = field(default_factory=CountedOn)
     malformed: Malformed = field(default_factory=Malformed)
+    begin: int | None = None
+    """The first number in the file."""
+    begin_line: int = 0
+    """Where it is."""
     has_header: bool = False
-    is_busybox: bool = False
+    is_busybox: bool | None = None
     transmitted: int | None = None
     total: float | None = None
     """Time of the whole run by the summary [s]."""
+    below: int = 0
+    """Replies whose time is less than what is printed."""
 
 
 def _matches(head: bytes, path: Path) -> bool:
@@ -72,42 +66,50 @@ def _matches(head: bytes, path: Path) -> bool:
 def _read(path: Path, options: Options) -> Measurement:
     found = _Found()
     for block in blocks(path, options.progress):
-        _read_block(block, found)
-    if not any(len(seq) for seq in found.seq):
+        _read_block(block, found, path)
+    if found.begin is None:
         only = ": it has the summary alone; run ping without -q" if found.transmitted is not None else ""
         raise MeasurementError(f"{path}: has no line of a packet{only}")
     return _measurement(str(path), found, options)
 
 
-def _read_block(block: Block, found: _Found) -> None:
-    text = block.text
+def _read_block(block: Block, found: _Found, path: Path) -> None:
+    text, last = block.text, len(block.text) - 1
     signs = np.flatnonzero((text == ord("=")) | (text == ord("<")))
     at_seq = signs[is_preceded_by(text, signs, b"seq")]
+    at_ttl = signs[is_preceded_by(text, signs, b" ttl") | is_preceded_by(text, signs, b" hlim")]
     lines = len(block.starts)
     line_of_seq = block.line_of(at_seq)
-    rtt = _milliseconds(block, signs[~is_preceded_by(text, signs, b"ttl")] + 1, lines)
+    rtt = _milliseconds(block, signs + 1, lines)
     first = _after_stamp(block)
     stamped = text[block.starts] == ord("[")
     stamp = np.full(lines, np.nan)
-    stamp[stamped] = numbers_at(text, block.starts[stamped] + 1).values
+    stamp[stamped] = numbers_at(text, block.starts[stamped] + 1, commas=True).values
     letter = text[first]
     is_reply = (letter >= ord("0")) & (letter <= ord("9"))
-    is_none = np.isin(letter, np.frombuffer(b"nFR", dtype=np.uint8))  # no answer yet, From, Request timeout
-    whole = np.zeros(lines, dtype=np.bool_)
+    has_ttl = np.zeros(lines, dtype=np.bool_)
+    has_ttl[block.line_of(at_ttl)] = True
     numbers = numbers_at(text, at_seq + 1)
-    whole[line_of_seq[numbers.length > 0]] = True
-    whole &= is_reply | is_none
-    kept = whole[line_of_seq] & (numbers.length > 0)
-    kept &= np.append(True, np.diff(line_of_seq) > 0)  # the first number of a line
+    ends = text[np.minimum(at_seq + 1 + numbers.length, last)]
+    # What is not a reply says of a number that none came yet; a line with a time to live whose beginning is missing is
+    # neither, and of a number at the end of a reply's line digits may be missing.
+    is_whole = (numbers.length > 0) & (is_reply[line_of_seq] == has_ttl[line_of_seq])
+    is_whole |= (numbers.length > 0) & is_reply[line_of_seq] & (ends == ord(" "))
+    kept = is_whole & np.append(True, np.diff(line_of_seq) > 0)[: len(at_seq)]  # the first number of a line
     rows = line_of_seq[kept]
-    found.seq.append(numbers.integers[kept])
-    found.is_reply.append(is_reply[rows])
-    found.rtt.append(rtt[rows])
-    found.stamp.append(stamp[rows])
-    if not found.is_busybox and len(at_seq):
-        found.is_busybox = not bool(is_preceded_by(text, at_seq[:1], b"icmp_seq")[0])
-    for i in np.flatnonzero(~whole).tolist():
-        _read_other(block, i, found)
+    seq, is_reply = found.numbers.take(numbers.integers[kept]), is_reply[rows]
+    if found.begin is None and len(seq):
+        found.begin, found.begin_line = int(seq[0]), block.number + int(rows[0])
+        found.is_busybox = not bool(is_preceded_by(text, at_seq[kept][:1], b"icmp_seq")[0])
+    found.grid.mention(seq[~is_reply])
+    rows, rtt = rows[is_reply], rtt[rows[is_reply]]
+    sent = stamp[rows] - np.nan_to_num(rtt)
+    found.grid.add(seq[is_reply], (rtt,), None if np.isnan(sent).all() else sent)
+    found.below += int(np.count_nonzero(text == ord("<")))
+    has_number = np.zeros(lines, dtype=np.bool_)
+    has_number[line_of_seq[kept]] = True
+    for i in np.flatnonzero(~has_number).tolist():
+        _read_other(block, i, found, path)
 
 
 def _milliseconds(block: Block, places: Places, lines: int) -> Floats:
@@ -116,7 +118,7 @@ def _milliseconds(block: Block, places: Places, lines: int) -> Floats:
     Whatever is before them: ping speaks the user's language.
     """
     text, last = block.text, len(block.text) - 1
-    numbers = numbers_at(text, places)
+    numbers = numbers_at(text, places, commas=True)
     ends = places + numbers.length
     is_time = numbers.length > 0
     for i, letter in enumerate(b" ms"):
@@ -137,10 +139,12 @@ def _after_stamp(block: Block) -> Places:
     return np.asarray(first)
 
 
-def _read_other(block: Block, i: int, found: _Found) -> None:
+def _read_other(block: Block, i: int, found: _Found, path: Path) -> None:
     """A line that has no packet in it."""
     line = block.line(i)
     if _HEADER.match(line):
+        if found.has_header or 0 < found.begin_line < block.number + i:
+            raise MeasurementError(f"{path}:{block.number + i}: another run begins: give each run of ping its own file")
         found.has_header = True
         return
     summary = _SUMMARY.search(line)
@@ -153,29 +157,26 @@ def _read_other(block: Block, i: int, found: _Found) -> None:
 
 
 def _measurement(source: str, found: _Found, options: Options) -> Measurement:
-    seq, is_reply = unwrapped(np.concatenate(found.seq)), np.concatenate(found.is_reply)
-    rtt, stamp = joined(found.rtt), joined(found.stamp)
-    first, last, notes = _range(seq, found)
-    for parts in (found.seq, found.is_reply, found.rtt, found.stamp):
-        parts.clear()  # of a long file they are as much again
+    first, last, notes = _range(found)
     interval, said = _interval(found, options)
-    seq, rtt, sent = seq[is_reply], rtt[is_reply], stamp[is_reply]
-    sent -= np.nan_to_num(rtt)
-    has_times = not np.isnan(sent).all() and len(seq) > 1
-    grid = on_grid(Numbered(seq, (rtt,), sent if has_times else None), first, last, interval)
-    if not has_times:
+    is_dated = found.grid.dated > 1
+    grid = found.grid.whole(interval, first, last)
+    if not is_dated:
         notes = (*notes, said)
+    if found.below:
+        notes = (*notes, f"{found.below} replies took less than the time that is printed, which stands for it")
     return Measurement(
         source=source, format="ping", sent=grid.sent, round_trip=PacketOutcomes(grid.outcome, grid.delays[0]),
         duplicates=grid.duplicates, reordered=grid.reordered, malformed=found.malformed, notes=notes,
     )  # fmt: skip
 
 
-def _range(seq: Ints, found: _Found) -> tuple[int, int, tuple[str, ...]]:
+def _range(found: _Found) -> tuple[int, int, tuple[str, ...]]:
     """First and last number that were sent, and what must be said of them."""
-    begins = 0 if found.is_busybox or int(seq.min()) == 0 else 1
-    first = begins if found.has_header and int(seq[0]) < 32768 else int(seq.min())
-    last, notes = int(seq.max()), []
+    grid, notes = found.grid, []
+    begins = 0 if found.is_busybox or grid.first == 0 else 1
+    is_whole = found.has_header and found.begin is not None and found.begin < 32768
+    first, last = min(begins, grid.first) if is_whole else grid.first, grid.last
     if not found.has_header:
         notes.append("the beginning of the log is missing: packets before the first one in it are unknown")
     if found.transmitted is None:

@@ -35,21 +35,30 @@ def words_of(block: Block, count: int) -> Words:
     return Words(np.flatnonzero(is_whole), begins[kept].reshape(-1, count), ends[kept].reshape(-1, count))
 
 
-def floats_at(text: Bytes, begins: Places, ends: Places) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-    """The numbers between these places, shape (n,), and whether each is one; NaN is, and so is nothing at all."""
+_NOTHING = (b"", b"nan", b"na", b"n/a", b"null", b"none", b"-", b"*", b"lost", b"timeout")
+"""What stands for a number that is not there."""
+
+
+def floats_at(
+    text: Bytes, begins: Places, ends: Places, commas: bool = False
+) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    """The numbers between these places, shape (n,), and whether each is one; NaN is, and so is nothing at all.
+
+    `commas`: a comma is a decimal mark, too.
+    """
     negative = text[np.minimum(begins, len(text) - 1)] == ord("-")
-    numbers = numbers_at(text, begins + negative)
+    numbers = numbers_at(text, begins + negative, commas)
     plain = (numbers.length == ends - begins - negative) & (numbers.length > 0)
     values = np.where(negative, -numbers.values, numbers.values)
     good = plain.copy()
     others = np.flatnonzero(~plain)
     if len(others):
         words = cells(text, begins[others], ends[others])
-        empty = np.isin(np.char.lower(words), (b"", b"nan", b"na", b"null", b"-"))
+        empty = np.isin(np.char.lower(words), _NOTHING)
         values[others[empty]], good[others[empty]] = np.nan, True
         for i, word in zip(others[~empty].tolist(), words[~empty].tolist(), strict=True):
             try:
-                values[i], good[i] = float(word), True
+                values[i], good[i] = float(word.replace(b",", b".") if commas else word), True
             except ValueError:
                 values[i] = np.nan
     return values, good
@@ -70,12 +79,14 @@ def lines_of_words(
         yield block, words
 
 
-def rows_of_words(
+def parts_of_rows(
     path: Path, count: int, malformed: Malformed, progress: Progress | None = None, wanted: Sequence[int] | None = None
-) -> Floats:
-    """The `wanted` columns of a file of `count` numbers a line between blanks, all by default: shape (n, wanted)."""
+) -> Iterator[Floats]:
+    """The `wanted` columns of a file of `count` numbers a line between blanks, all by default, in parts.
+
+    Each of shape (n, wanted). Lines that have others are malformed.
+    """
     columns = range(count) if wanted is None else wanted
-    parts = []
     for block, words in lines_of_words(path, count, malformed, progress):
         table = np.empty((len(words.lines), len(columns)))
         good = np.ones(len(table), dtype=np.bool_)
@@ -84,5 +95,4 @@ def rows_of_words(
             good &= fine
         for i in np.flatnonzero(~good).tolist():
             malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
-        parts.append(table[good])
-    return np.concatenate(parts) if parts else np.zeros((0, len(columns)))
+        yield table[good]
