@@ -231,7 +231,7 @@ def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
 def rows(found: LinkFigures) -> Iterator[tuple[str, ...]]:
     """Name and value for each direction, as text; a dash where the file does not tell."""
     directions = list(found.directions.values())
-    yield "Packets", *(str(len(direction.k)) for direction in directions)
+    yield "Packets", *(str(direction.count) for direction in directions)
     yield "Loss rate (95 %)", *map(_rate, directions)
     yield "Outages", *(str(len(direction.outages)) if direction.is_told else "-" for direction in directions)
     yield "Longest outage", *(_ms(direction.longest) if direction.is_told else "-" for direction in directions)

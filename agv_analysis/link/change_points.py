@@ -85,16 +85,19 @@ def _most_likely_change(k: Steps, lost: Outcomes, segment: Segment) -> tuple[flo
     length = _block_length(k, lost)
     if length * _FEWEST > len(k):
         return None, segment.begin
-    counts = _transitions_before(k, lost)
     edges = np.linspace(0, len(k) - 1, min(len(k) // length + 1, len(k))).astype(np.int64)  # no block is empty
-    blocks = np.diff(counts[:, edges], axis=1)
-    observed = _gains(np.cumsum(blocks, axis=1))
+    parts = [slice(first, last + 1) for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+    blocks = np.stack([_transitions_before(k[part], lost[part])[:, -1].copy() for part in parts], axis=1)
+    before = np.cumsum(blocks, axis=1)
+    observed = _gains(before)
     rng = np.random.default_rng(1)
     orders = np.argsort(rng.random((ORDERS, blocks.shape[1])), axis=1)
     reached = np.count_nonzero(_gains(np.cumsum(blocks[:, orders], axis=2)).max(axis=1) >= observed.max())
     best = int(np.argmax(observed))
+    around = slice(edges[best], edges[best + 2] + 1)  # the change is in the block before the best border, or behind it
     near = np.arange(edges[best] + 1, edges[best + 2])
-    exact = _gains(np.concatenate((counts[:, near], counts[:, -1:]), axis=1))
+    counts = before[:, best, None] - blocks[:, best, None] + _transitions_before(k[around], lost[around])[:, 1:-1]
+    exact = _gains(np.concatenate((counts, before[:, -1:]), axis=1))
     return float(1 + reached) / (ORDERS + 1), segment.begin + int(near[np.argmax(exact)]) + 1
 
 

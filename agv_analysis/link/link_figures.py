@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.link.change_points import Stationarity, stationarity
 from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
@@ -25,6 +26,15 @@ PERCENTILES = (50, 95, 99)
 UPLINK, DOWNLINK, ROUND_TRIP = "uplink", "downlink", "round_trip"
 
 
+_PART = 1 << 17
+"""Packets whose ages are worked out together."""
+
+
+def _rank(percent: int, count: int) -> int:
+    """Place in the order of so many values of the smallest one that so many per cent do not exceed."""
+    return max(0, -(-percent * count // 100) - 1)
+
+
 @dataclass(frozen=True)
 class Spread:
     """Percentiles of times [s]; values that occurred."""
@@ -38,11 +48,27 @@ class Spread:
     @classmethod
     def of(cls, values: Floats) -> Spread | None:
         """Of values, NaN left out; None if nothing is left."""
-        values = values[~np.isnan(values)]
-        if not len(values):
+        return cls.of_own(values.copy())
+
+    @classmethod
+    def of_own(cls, values: Floats) -> Spread | None:
+        """As `of`, of values that nobody else needs: their order changes, so that no other is needed."""
+        known = ~np.isnan(values)
+        count = int(np.count_nonzero(known))
+        if not count:
             return None
-        found = np.percentile(values, PERCENTILES, method="inverted_cdf").tolist()
-        return cls(float(values.mean()), tuple(found), float(values.max()), len(values))
+        mean = float(np.sum(values, where=known)) / count
+        ranks = [_rank(q, count) for q in PERCENTILES]
+        values.partition([*ranks, count - 1])  # NaN comes last
+        return cls(mean, tuple(values[ranks].tolist()), float(values[count - 1]), count)
+
+    @classmethod
+    def of_counts(cls, counts: NDArray[np.int64], unit: float) -> Spread:
+        """Of values 0, 1, 2 ... `unit`s, each of which occurred so often."""
+        count, upto = int(counts.sum()), np.cumsum(counts)
+        found = [unit * float(np.searchsorted(upto, _rank(q, count) + 1)) for q in PERCENTILES]
+        mean = unit * float(counts @ np.arange(len(counts))) / count
+        return cls(mean, tuple(found), unit * float(np.flatnonzero(counts)[-1]), count)
 
     def to_json(self) -> dict[str, float]:
         """`mean_s`, `p50_s`, `p95_s`, `p99_s`, `max_s`."""
@@ -53,12 +79,26 @@ class Spread:
 class DirectionFigures:
     """One direction, or the round trip, of packets sent at times [s], shape (N,)."""
 
-    def __init__(self, name: str, packets: PacketOutcomes, sent: Floats) -> None:
-        self.name = name
+    def __init__(self, name: str, packets: PacketOutcomes, sent: Floats, interval: float) -> None:
+        """`interval`: from one packet to the next [s], mostly."""
+        self.name, self._interval = name, interval
         self._packets, self._sent = packets, sent
-        self.k: Steps = np.flatnonzero(packets.known)
-        """Numbers of the packets of which the outcome is known, shape (n,)."""
-        self.lost: Outcomes = packets.lost[self.k]
+
+    @property
+    def k(self) -> Steps:
+        """Numbers of the packets of which the outcome is known, shape (n,); made anew, since there may be many."""
+        return np.flatnonzero(self._packets.known)
+
+    @property
+    def lost(self) -> Outcomes:
+        """Which of these were lost, shape (n,)."""
+        known = self._packets.known
+        return self._packets.lost if known.all() else self._packets.lost[known]
+
+    @cached_property
+    def count(self) -> int:
+        """Packets of which the outcome is known."""
+        return int(np.count_nonzero(self._packets.known))
 
     @property
     def is_told(self) -> bool:
@@ -68,7 +108,7 @@ class DirectionFigures:
     @property
     def count_lost(self) -> int:
         """Packets that were lost for certain."""
-        return int(np.count_nonzero(self.lost))
+        return int(np.count_nonzero(self._packets.lost))
 
     @cached_property
     def fit(self) -> ChannelFit:
@@ -85,7 +125,7 @@ class DirectionFigures:
         if not self.is_told:
             return None
         if not self.count_lost:
-            return Estimate(0.0, 0.0, 1.0 - (1.0 - CONFIDENCE) ** (1.0 / len(self.k)))
+            return Estimate(0.0, 0.0, 1.0 - (1.0 - CONFIDENCE) ** (1.0 / self.count))
         return self.fit.loss_rate
 
     @cached_property
@@ -94,26 +134,34 @@ class DirectionFigures:
 
         One that is open at the end lasts at least to the end of its last packet's interval.
         """
-        begins = outage_begins(self.k, self.lost)
-        last = begins + outage_lengths(self.k, self.lost) - 1
-        times = np.append(self._sent[self.k], self._sent[self.k[-1]] + self._interval if len(self.k) else 0.0)
-        return np.asarray(times[last + 1] - times[begins])
+        k, lost = self.k, self.lost
+        begins = outage_begins(k, lost)
+        ends = begins + outage_lengths(k, lost)
+        closed = np.where(
+            ends < len(k), self._sent[k[np.minimum(ends, len(k) - 1)]], self._sent[k[-1]] + self._interval
+        )
+        return np.asarray(closed - self._sent[k[begins]])
 
     @property
     def longest(self) -> float:
         """The longest outage [s], 0 if there was none."""
         return float(self.outages.max(initial=0.0))
 
-    @property
-    def _interval(self) -> float:
-        return float(np.median(np.diff(self._sent))) if len(self._sent) > 1 else 0.0
-
     @cached_property
     def age(self) -> Spread | None:
         """How old the freshest packet is that has come, by the losses alone [s]; None where the file cannot tell."""
-        if not self.is_told or not len(self.k):
+        if not self.is_told or not self.count:
             return None
-        return Spread.of(np.asarray(ages(self.k, self.lost) * self._interval, np.float64))
+        k, lost = self.k, self.lost
+        counts, newest = np.zeros(0, dtype=np.int64), k[:1]
+        for first in range(0, len(k), _PART):
+            part = slice(first, first + _PART)
+            found = ages(np.append(newest, k[part]), np.append(False, lost[part]))[1:]
+            newest = k[part][-1:] - found[-1:]
+            more = np.bincount(found, minlength=len(counts))
+            more[: len(counts)] += counts
+            counts = more
+        return Spread.of_counts(counts, self._interval)
 
     @cached_property
     def delay(self) -> Spread | None:
@@ -124,12 +172,15 @@ class DirectionFigures:
     def jitter(self) -> Spread | None:
         """By how much the delay differs from one packet to the next, in absolute value [s]."""
         delay = self._packets.delay
-        return None if delay is None else Spread.of(np.abs(np.diff(delay)))
+        if delay is None:
+            return None
+        steps = np.diff(delay)
+        return Spread.of_own(np.abs(steps, out=steps))
 
     def to_json(self) -> dict[str, Any]:
         """The figures by name; `loss_rate` is null where the file cannot tell."""
         return {
-            "packets": len(self.k),
+            "packets": self.count,
             "lost": self.count_lost,
             "loss_rate": _estimate(self.loss_rate),
             "outages": len(self.outages),
@@ -146,9 +197,10 @@ class LinkFigures:
 
     def __init__(self, measured: Measurement) -> None:
         self.measured = measured
+        interval = measured.interval
         named = {UPLINK: measured.uplink, DOWNLINK: measured.downlink, ROUND_TRIP: measured.round_trip}
         self.directions = {
-            name: DirectionFigures(name, packets, measured.sent)
+            name: DirectionFigures(name, packets, measured.sent, interval)
             for name, packets in named.items()
             if packets is not None
         }

@@ -64,8 +64,9 @@ def link_of_loop(measured: Measurement, rtt: str = UP) -> LinkOfLoop:
         notes.append(f"only the round trip is known: {said} (--rtt {rtt})")
     found, early = [], 0
     for delay in delays:
-        early += 0 if delay is None else int(np.count_nonzero(delay < 0.0))
-        found.append(None if delay is None else np.maximum(delay, 0.0))
+        below = 0 if delay is None else int(np.count_nonzero(delay < 0.0))
+        early += below
+        found.append(np.maximum(delay, 0.0) if below and delay is not None else delay)
     if early:
         notes.append(f"{early} delays are below 0, since the clocks do not agree: they count as 0")
     nothing = np.zeros(measured.packets, dtype=np.bool_)
@@ -92,6 +93,8 @@ def _shares(both: PacketOutcomes, rtt: str) -> tuple[tuple[Floats | None, Floats
 def _held(packets: PacketOutcomes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Lost or not, shape (N,); where that is not known, what it was before, received at the beginning."""
     known = packets.known
+    if known.all():
+        return packets.lost
     last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
     outcome = np.where(last >= 0, packets.outcome[np.maximum(last, 0)], RECEIVED)
     return np.asarray(outcome == LOST)
@@ -99,8 +102,11 @@ def _held(packets: PacketOutcomes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 def _increasing(sent: Floats) -> Floats:
     """Times [s] that increase by a microsecond at least: stamps may be coarser than packets are apart."""
-    steps = np.maximum(np.diff(sent), 1e-6)
-    return np.concatenate(([0.0], np.cumsum(steps))) if np.any(np.diff(sent) < 1e-6) else sent - sent[0]
+    steps = np.diff(sent)
+    if not np.any(steps < 1e-6):
+        return sent if sent[0] == 0.0 else sent - sent[0]
+    np.maximum(steps, 1e-6, out=steps)
+    return np.concatenate(([0.0], np.cumsum(steps, out=steps)))
 
 
 def of_trace(file: str, link: str, ts: float) -> Measurement:

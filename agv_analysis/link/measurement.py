@@ -112,7 +112,10 @@ class Measurement:
     @property
     def interval(self) -> float:
         """Median time between packets sent [s]; 0 for a single one."""
-        return float(np.median(np.diff(self.sent))) if self.packets > 1 else 0.0
+        if self.packets < 2:
+            return 0.0
+        steps = np.diff(self.sent)
+        return float(np.median(steps, overwrite_input=True))
 
     @property
     def whole(self) -> PacketOutcomes:

@@ -8,9 +8,12 @@ is a censored observation, kept apart from the complete ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from agv_analysis.metrics.outages import is_unbroken
 
 Steps = NDArray[np.int64]
 Outcomes = NDArray[np.bool_]
@@ -20,8 +23,10 @@ Outcomes = NDArray[np.bool_]
 class Intervals:
     """What a recording shows of a link, in the order of time; lengths in slots."""
 
-    between_receptions: Steps
-    """L, complete, shape (n,)."""
+    k: Steps
+    """The slots of the recording, shape (N,)."""
+    lost: Outcomes
+    """Their outcomes."""
     outages: Steps
     """Complete series of lost slots."""
     gaps: Steps
@@ -31,6 +36,16 @@ class Intervals:
     longest_open_gap: int
     """The same of gaps."""
 
+    @cached_property
+    def between_receptions(self) -> Steps:
+        """L, complete, shape (n,)."""
+        received = np.flatnonzero(~self.lost)
+        between = np.diff(received)
+        if is_unbroken(self.k):
+            return between
+        series = np.searchsorted(np.flatnonzero(np.diff(self.k) != 1), received)
+        return np.asarray(between[np.diff(series) == 0])
+
     @property
     def longest(self) -> int:
         """Slots of the longest outage, complete or not; 0 without losses."""
@@ -39,15 +54,14 @@ class Intervals:
 
 def reception_intervals(k: Steps, lost: Outcomes) -> Intervals:
     """Intervals of outcomes `lost` of the slots `k`, increasing, both of shape (N,), N >= 1."""
-    breaks = np.diff(k) != 1
-    received = np.flatnonzero(~lost)
-    unbroken = np.diff(np.append(0, np.cumsum(breaks))[received]) == 0
+    breaks = np.zeros(len(k) - 1, dtype=np.bool_) if is_unbroken(k) else np.diff(k) != 1
     begins = np.append(0, np.flatnonzero(breaks | (lost[1:] != lost[:-1])) + 1)
     lengths, is_lost = np.diff(begins, append=len(lost)), lost[begins]
     seen_from = np.append(False, ~breaks[begins[1:] - 1])
     whole = seen_from & np.append(seen_from[1:], False)
     return Intervals(
-        between_receptions=np.diff(received)[unbroken],
+        k,
+        lost,
         outages=lengths[whole & is_lost],
         gaps=lengths[whole & ~is_lost],
         longest_open=int(lengths[~whole & is_lost].max(initial=0)),

@@ -33,12 +33,12 @@ def age_and_loss_samples(k: Steps, lost: Outcomes) -> tuple[Floats, Floats] | tu
 
     None where receptions are too few. With intervals L between receptions: E[L (L - 1) / 2] / E[L] and E[L - 1] / E[L].
     """
-    L = reception_intervals(k, lost).between_receptions.astype(np.float64)
+    L = reception_intervals(k, lost).between_receptions
     parts = min(_MOST, int(np.sqrt(2 * len(L))))
     if parts < _FEWEST:
         return None, None
-    ends = np.searchsorted(np.cumsum(L), np.linspace(0.0, L.sum(), parts + 1)[1:-1]) + 1
+    ends = np.searchsorted(np.cumsum(L), np.linspace(0.0, float(L.sum()), parts + 1)[1:-1]) + 1
     begins = np.unique(np.append(0, np.minimum(ends, len(L) - 1)))
-    sums = np.add.reduceat(np.array([L, L * (L - 1.0) / 2.0, L - 1.0]), begins, axis=1)
+    sums = np.stack([np.add.reduceat(values, begins) for values in (L, L * (L - 1) // 2, L - 1)]).astype(np.float64)
     slots, ages, losses = (weights(len(begins)) @ sums.T).T
     return ages / slots, losses / slots

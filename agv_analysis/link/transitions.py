@@ -21,6 +21,7 @@ from typing import TypeVar
 import numpy as np
 
 from agv_analysis.link.reception_intervals import Outcomes, Steps
+from agv_analysis.metrics.outages import is_unbroken
 from agv_analysis.run import Floats
 
 SAMPLES = 4000
@@ -100,8 +101,10 @@ def interval_of(transitions: Transitions, figure: Callable[[Floats, Floats], Flo
 
 def count_transitions(k: Steps, lost: Outcomes) -> Transitions:
     """Transitions of the outcomes of slots `k`, increasing, shape (N,)."""
-    known = np.diff(k) == 1
-    before, after = lost[:-1][known], lost[1:][known]
+    before, after = lost[:-1], lost[1:]
+    if not is_unbroken(k):
+        known = np.diff(k) == 1
+        before, after = before[known], after[known]
     return Transitions(
         to_lost=int(np.count_nonzero(~before & after)),
         delivered=int(np.count_nonzero(~before)),

@@ -150,8 +150,8 @@ def age_statistics(age: Steps, ts: float) -> Age:
 
 def outage_lengths(k: Steps, lost: Outcomes) -> Steps:
     """Length of each series of consecutive lost slots, in the order of time; `k` and `lost` have shape (N,)."""
-    begins = outage_begins(k, lost)
-    ends = np.flatnonzero(lost & ~_follows_lost(-k[::-1], lost[::-1])[::-1])
+    goes_on = lost & _follows_lost(k, lost)
+    begins, ends = np.flatnonzero(lost & ~goes_on), np.flatnonzero(lost & ~np.append(goes_on[1:], False)[: len(lost)])
     return np.asarray(ends - begins + 1, dtype=np.int64)
 
 
@@ -212,9 +212,15 @@ def longest_outage_between(outages: Iterable[OutageRows], first: int, last: int)
     return found
 
 
+def is_unbroken(k: Steps) -> bool:
+    """Do slots `k`, increasing, follow each other without a gap?"""
+    return not len(k) or int(k[-1]) - int(k[0]) == len(k) - 1
+
+
 def _follows_lost(k: Steps, lost: Outcomes) -> Outcomes:
     """Is the slot before each one known, and lost?"""
-    return np.concatenate(([False], lost[:-1] & (np.diff(k) == 1)))
+    before = lost[:-1] if is_unbroken(k) else lost[:-1] & (np.diff(k) == 1)
+    return np.concatenate(([False], before))[: len(lost)]
 
 
 def ages(k: Steps, lost: Outcomes) -> Steps:

@@ -55,7 +55,7 @@ _ALWAYS_FLAGS = ("lost", *_DIRECTIONS)
 _EMPTY = 2
 """Of a flag: no cell says it."""
 
-_PART = 1 << 20
+_PART = 1 << 17
 """Packets that are looked at together."""
 
 Part = dict[str, NDArray[np.float64]]
@@ -165,8 +165,9 @@ def _measurement(source: str, values: dict[str, NDArray[Any]], rows: _Rows, opti
     if up is not None and down is None and whole is None:
         notes.append("one direction was measured, and is taken for the uplink")
     reordered = _overtaken(values, sent)
+    sent -= sent[0]
     return Measurement(
-        source=source, format="table", sent=sent - sent[0], uplink=up, downlink=down, round_trip=whole,
+        source=source, format="table", sent=sent, uplink=up, downlink=down, round_trip=whole,
         reordered=reordered, malformed=rows.malformed, notes=tuple(notes),
     )  # fmt: skip
 
@@ -178,7 +179,7 @@ def _times(values: dict[str, NDArray[Any]], options: Options) -> tuple[Floats, s
             continue
         unknown = np.isnan(values[role])
         if not unknown.any():
-            return values[role], ""
+            return values.pop(role), ""
         if not unknown.all():
             k = np.arange(len(unknown), dtype=np.float64)
             said = f"{int(np.count_nonzero(unknown))} times were interpolated"

@@ -35,7 +35,7 @@ def test_lengths_that_are_geometric_get_p_values_that_are_uniform(hit: float) ->
 def test_the_longest_length_has_the_probability_that_counting_gives() -> None:
     """All ways to write 12 as 4 lengths are equally likely; the bound is exact where two cannot be so long."""
     ways = [w for w in itertools.product(range(1, 10), repeat=4) if sum(w) == 12]
-    found = goodness_of_intervals(Intervals(EMPTY, np.array([7, 2, 1, 2]), EMPTY, 0, 0)).longest_outage
+    found = goodness_of_intervals(Intervals(EMPTY, EMPTY == 1, np.array([7, 2, 1, 2]), EMPTY, 0, 0)).longest_outage
     assert found == pytest.approx(np.mean([max(w) >= 7 for w in ways]), rel=1e-9)
 
 
