@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     "--slots", type=click.IntRange(1, 10_000_000), default=100_000, show_default=True, help="Number of slots."
 )
 @click.option("--fit", metavar="TRACE", help="Use the model that fits this trace, instead of the file's channel.")
-@click.option("--from-netem", metavar="LINE", help='Use netem\'s channel, as in "loss gemodel 2% 20% 100% 0%".')
+@click.option(
+    "--from-netem", metavar="LINE", help='Use netem\'s channel, as in "delay 20ms loss 5% 25%", or a pasted tc line.'
+)
 @click.option("--netem", is_flag=True, help="Print the channel as an option of `tc qdisc ... netem`, and nothing else.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the distribution of n_ul to this file.")
@@ -53,8 +55,8 @@ def command(
 
     from agv_analysis.link.channel_files import draw, write_csv
     from agv_analysis.link.channel_study import fitted, study
-    from agv_analysis.link.netem import from_netem as channel_of
     from agv_analysis.link.netem import to_netem
+    from agv_analysis.link.netem_text import read_netem
     from agv_analysis.scenario import load_scenario
     from agv_analysis.simulation.reference import reference_of
     from agv_plant.channels.timed_trace import read_trace
@@ -68,7 +70,9 @@ def command(
     if fit is not None:
         channel = fitted(read_trace(fit, link).lost, channel)
     if from_netem is not None:
-        channel = channel_of(from_netem, channel)
+        channel, differences = read_netem(from_netem, channel)
+        for sentence in differences:
+            click.echo(f"not the same: {sentence}", err=True)
     if netem:
         click.echo(to_netem(channel))
         return

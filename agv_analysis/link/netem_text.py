@@ -15,6 +15,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Callable, Sequence
+from decimal import Decimal
 
 import numpy as np
 
@@ -22,10 +23,16 @@ from agv_analysis.link.markov_channel import Chain, bursty
 from agv_analysis.link.netem import NetemError
 from agv_plant.parameters import ChannelParameters
 
-_SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "ms": 1e-3, "msec": 1e-3, "msecs": 1e-3, "us": 1e-6, "usec": 1e-6,
-            "usecs": 1e-6, "ns": 1e-9, "nsec": 1e-9, "nsecs": 1e-9, "": 1e-6}  # fmt: skip
-_PERCENT = re.compile(r"([0-9.]+(?:e-?\d+)?)(%?)", re.IGNORECASE)
-_TIME = re.compile(r"([0-9.]+(?:e-?\d+)?)([a-z]*)", re.IGNORECASE)
+_SECONDS = {
+    **dict.fromkeys(("s", "sec", "secs"), Decimal(1)), **dict.fromkeys(("ms", "msec", "msecs"), Decimal("1e-3")),
+    **dict.fromkeys(("us", "usec", "usecs", ""), Decimal("1e-6")),
+    **dict.fromkeys(("ns", "nsec", "nsecs"), Decimal("1e-9")),
+}  # fmt: skip
+"""What a unit of time is worth [s]; without one netem takes a number for microseconds."""
+
+_NUMBER = r"(\d+\.?\d*(?:e-?\d+)?|\.\d+(?:e-?\d+)?)"
+_PERCENT = re.compile(rf"{_NUMBER}%?", re.IGNORECASE)
+_TIME = re.compile(rf"{_NUMBER}([a-z]*)", re.IGNORECASE)
 _LABELS = ("p", "r", "1-h", "1-k", "p13", "p31", "p32", "p23", "p14", "random", "ecn")
 _SKIPPED = {"limit": 1, "seed": 1, "ecn": 0}
 """Options that say nothing of a single message of the loop, and how many words follow them."""
@@ -51,14 +58,14 @@ class _Line:
     def take(self) -> str:
         return self.words.pop(0)
 
-    def shares(self) -> list[float]:
-        """Percentages that follow, labels between them left out."""
-        found = []
+    def shares(self) -> list[Decimal]:
+        """Percentages that follow as shares, labels between them left out; exactly as they are written."""
+        found = list[Decimal]()
         while self.words:
             number = _PERCENT.fullmatch(self.words[0])
             if number is not None:
-                share = float(number[1]) / 100.0
-                if not 0.0 <= share <= 1.0:
+                share = Decimal(number[1]) / 100
+                if share > 1:
                     raise NetemError(f"netem: a percentage must be from 0% to 100%, got {self.words[0]!r}")
                 found.append(share)
             elif self.words[0] not in _LABELS:
@@ -72,7 +79,7 @@ class _Line:
         while self.words and self._is_time():
             number = _TIME.fullmatch(self.take())
             assert number is not None
-            found.append(float(number[1]) * _SECONDS[number[2].lower()])
+            found.append(float(Decimal(number[1]) * _SECONDS[number[2].lower()]))
         return found
 
     def _is_time(self) -> bool:
@@ -81,14 +88,23 @@ class _Line:
 
 
 def read_netem(line: str, channel: ChannelParameters) -> tuple[ChannelParameters, tuple[str, ...]]:
-    """`channel` as a line of netem has it, and a sentence for each difference. Raises NetemError."""
+    """`channel` as a line of netem has it, and a sentence for each difference. Raises NetemError.
+
+    Its other parameters stay. What the line leaves out is as in netem: of gemodel p alone is independent losses
+    (r = 1 - p), the bad state loses all and the good one nothing; without `loss` nothing is lost, without `delay`
+    nothing is late, without `duplicate` nothing comes twice.
+    """
     words, differences = _Line(line), list[str]()
     found = dataclasses.replace(channel, model="perfect", delay=0.0, jitter=0.0, duplicate=0.0)
-    known = False
+    known = set[_Reader]()
     while words.words:
         word = words.take()
         if word in _READERS:
-            found, known = _READERS[word](words, found, differences), True
+            reader = _READERS[word]
+            if reader in known:
+                raise NetemError(f"netem takes {word} once, in {line.strip()!r}")
+            known.add(reader)
+            found = reader(words, found, differences)
         elif word in _SKIPPED:
             del words.words[: _SKIPPED[word]]
         else:
@@ -115,25 +131,32 @@ def _loss(line: _Line, channel: ChannelParameters, differences: list[str]) -> Ch
     shares = line.shares()
     if not shares:
         raise NetemError(f"netem: loss needs a percentage, in {line.text.strip()!r}")
+    _most(shares, {"gemodel": 4, "state": 5, "random": 2}[kind], f"loss {kind}", line)
     if kind == "gemodel":
-        p, r, lost_bad, lost_good = [*shares, *(1.0 - shares[0], 1.0, 0.0)[len(shares) - 1 :]][:4]
-        return dataclasses.replace(
-            channel, model="gilbert_elliott", p=p, r=r, h=round(1.0 - lost_bad, 15), k=round(1.0 - lost_good, 15)
-        )
+        figures = (*shares, *(1 - shares[0], Decimal(1), Decimal(0))[len(shares) - 1 :])
+        p, r, h, k = figures[0], figures[1], 1 - figures[2], 1 - figures[3]
+        return dataclasses.replace(channel, model="gilbert_elliott", p=float(p), r=float(r), h=float(h), k=float(k))
     if kind == "state":
         return _states(shares, channel, differences)
-    if len(shares) == 1 or shares[1] == 0.0:
-        return dataclasses.replace(channel, model="bernoulli", p=shares[0])
-    rate, burst = correlated_loss(shares[0], shares[1])
+    probability, correlation = (*map(float, shares), 0.0)[:2]
+    if correlation == 0.0:
+        return dataclasses.replace(channel, model="bernoulli", p=probability)
+    rate, burst = correlated_loss(probability, correlation)
     differences.append(
-        f"loss {shares[0]:.6g} with correlation {shares[1]:.6g}: netem's own recursion loses {rate:.4g} of the "
+        f"loss {probability:.6g} with correlation {correlation:.6g}: netem's own recursion loses {rate:.4g} of the "
         f"packets, {burst:.4g} in a row on average; the Gilbert channel of these two figures stands for it"
     )
     return _gilbert(rate, burst, channel)
 
 
-def _states(shares: Sequence[float], channel: ChannelParameters, differences: list[str]) -> ChannelParameters:
-    p13, p31, p32, p23, p14 = [*shares, *(1.0 - shares[0], 0.0, 1.0, 0.0)[len(shares) - 1 :]][:5]
+def _most(shares: Sequence[Decimal], count: int, what: str, line: _Line) -> None:
+    if len(shares) > count:
+        raise NetemError(f"netem: {what} takes {count} percentages at most, got {len(shares)} in {line.text.strip()!r}")
+
+
+def _states(shares: Sequence[Decimal], channel: ChannelParameters, differences: list[str]) -> ChannelParameters:
+    usual = (1 - shares[0], Decimal(0), Decimal(1), Decimal(0))
+    p13, p31, p32, p23, p14 = map(float, (*shares, *usual[len(shares) - 1 :]))
     if p32 == 0.0 and p14 == 0.0:  # then there is no burst with receptions in it, and no loss outside of one
         return dataclasses.replace(channel, model="gilbert_elliott", p=p13, r=p31, h=0.0, k=1.0)
     chain = four_states(p13, p31, p32, p23, p14)
@@ -209,11 +232,11 @@ def _duplicate(line: _Line, channel: ChannelParameters, differences: list[str]) 
         raise NetemError(f"netem: duplicate needs a percentage, in {line.text.strip()!r}")
     if len(shares) > 1 and shares[1] > 0.0:
         differences.append("duplicates are correlated in netem, and independent of each other here")
-    return dataclasses.replace(channel, duplicate=shares[0])
+    return dataclasses.replace(channel, duplicate=float(shares[0]))
 
 
 def _corrupt(line: _Line, channel: ChannelParameters, differences: list[str]) -> ChannelParameters:
-    share = (*line.shares(), 0.0)[0]
+    share = (*line.shares(), Decimal(0))[0]
     differences.append(
         f"corrupt {share:.6g}: a packet with a wrong bit fails its checksum, which is a loss more; it is left out here"
     )
@@ -221,7 +244,7 @@ def _corrupt(line: _Line, channel: ChannelParameters, differences: list[str]) ->
 
 
 def _reorder(line: _Line, channel: ChannelParameters, differences: list[str]) -> ChannelParameters:
-    share = (*line.shares(), 0.0)[0]
+    share = (*line.shares(), Decimal(0))[0]
     if line.words[:1] == ["gap"]:
         del line.words[:2]
     differences.append(

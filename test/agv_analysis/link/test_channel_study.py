@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from hypothesis import strategies as st
 
 from agv_analysis.link.channel_study import age_distribution, fitted, study
 from agv_analysis.link.markov_channel import bernoulli, gilbert_elliott
-from agv_analysis.link.netem import NetemError, from_netem, to_netem
+from agv_analysis.link.netem import NetemError, to_netem
+from agv_analysis.link.netem_text import read_netem
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import losses
 
@@ -96,6 +98,14 @@ def test_a_channel_with_parameters_has_them_fitted() -> None:
 
 # -- netem -----------------------------------------------------------------------------------------------------------
 
+
+def from_netem(line: str, channel: ChannelParameters) -> ChannelParameters:
+    """A channel of which a line says all."""
+    found, differences = read_netem(line, channel)
+    assert differences == ()
+    return found
+
+
 percents = st.integers(0, 10_000_000).map(lambda parts: f"{parts / 100_000:.5f}".rstrip("0").rstrip("."))
 
 
@@ -131,21 +141,20 @@ def test_what_a_line_leaves_out_is_as_in_netem() -> None:
     [
         ("loss gemodel 1% x", "'x'"),
         ("loss gemodel 101%", "'101%'"),
-        ("loss gemodel nan", "'nan'"),
+        ("loss gemodel nan", "needs a percentage, in 'loss gemodel nan'"),
         ("loss gemodel", "'loss gemodel'"),
-        ("loss state 1%", "'loss state 1%'"),
-        ("loss random 1% loss random 2%", "'loss random 1% loss random 2%'"),
-        ("delay 10m", "'10m'"),
-        ("delay 10ms 2ms 25%", "'delay 10ms 2ms 25%'"),
-        ("delay -1ms", "'-1ms'"),
-        ("delay 1.2.3ms", "'1.2.3ms'"),
+        ("loss gemodel 1% 2% 3% 4% 5%", "takes 4 percentages at most, got 5"),
+        ("loss random 1% loss random 2%", "takes loss once, in 'loss random 1% loss random 2%'"),
+        ("delay 10ms latency 20ms", "takes latency once"),
+        ("delay 10m", "needs a time, as in delay 20ms, in 'delay 10m'"),
+        ("delay -1ms", "in 'delay -1ms'"),
+        ("delay 1.2.3ms", "in 'delay 1.2.3ms'"),
         ("duplicate", "'duplicate'"),
-        ("rate 1mbit", "'rate 1mbit'"),
-        ("", "''"),
+        ("", "'' sets nothing of a channel"),
     ],
 )
 def test_a_line_that_netem_would_not_take_is_refused(line: str, found: str) -> None:
-    with pytest.raises(NetemError, match=f"must be loss gemodel .*; got {found}"):
+    with pytest.raises(NetemError, match=re.escape(found)):
         from_netem(line, ChannelParameters())
 
 
@@ -222,6 +231,11 @@ def test_channel_fits_a_trace_and_speaks_netem(agv_ncs: AgvNcs, tmp_path: Path) 
     assert "gilbert_elliott, p 0.02" in said
     line = "loss gemodel 1% 10% 70% 0.1%"
     assert agv_ncs("channel", "config/outages.yaml", "--from-netem", line, "--netem") == (0, line)
+    pasted = "qdisc netem 8001: dev eth0 root refcnt 2 limit 1000 delay 20ms  5ms 25% loss 5%"
+    code, said = agv_ncs("channel", "config/outages.yaml", "--from-netem", pasted, "--netem")
+    assert code == 0
+    assert said.splitlines()[-1] == "delay 20ms 5ms loss random 5%"
+    assert "not the same: delays are correlated by 0.25 in netem" in said
     code, said = agv_ncs("channel", "config/outages.yaml", "--link", "downlink", "--netem")
     assert code == 1
     assert "netem has no channel perfect" in said

@@ -132,3 +132,20 @@ def test_a_file_with_a_line_is_a_setting(tmp_path: Path) -> None:
     path.write_text("tc qdisc add dev eth0 root netem loss 1%\ntc qdisc add dev eth1 root netem loss 2%\n")
     with pytest.raises(MeasurementError, match="has 2 lines for netem, which are one link each"):
         read_link(path)
+
+
+def test_what_tc_shows_of_several_devices(tmp_path: Path) -> None:
+    path = tmp_path / "tc.txt"
+    netem = "qdisc netem 1: dev eth0 root refcnt 2 limit 1000 delay 20ms  5ms loss random 5% seed 42"
+    others = (
+        "qdisc noqueue 0: dev lo root refcnt 2 \n Sent 0 bytes 0 pkt (dropped 0, overlimits 0 requeues 0) \n"
+        "qdisc tbf 10: dev eth0 parent 1:1 rate 1Mbit burst 1600b lat 50ms \nqdisc htb 1: dev wlan0 root\n"
+    )
+    path.write_text(others + netem + "\n backlog 0b 0p requeues 0\n")
+    found = read_link(path)
+    assert isinstance(found, Setting)
+    assert (found.channel.delay, found.channel.jitter, found.channel.p) == (0.02, 0.005, 0.05)
+    assert found.differences == ("the qdisc tbf of eth0 acts on the link as well, and is left out here",)
+    path.write_text(f"{netem}\n{netem.replace('eth0', 'wlan0')}\n")
+    with pytest.raises(MeasurementError, match=r"one link each \(eth0, wlan0\): leave one of them"):
+        read_link(path)
