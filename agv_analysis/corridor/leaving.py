@@ -31,6 +31,7 @@ from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.loop import RunInputs, history
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.single import settings_of, simulate
+from agv_analysis.simulation.trace_windows import parts_of_traces, with_windows
 from agv_plant.channels.registry import TRACE
 from agv_plant.parameters import ChannelParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
@@ -88,10 +89,13 @@ def leaving(
     progress: Callable[[int], None] = lambda done: None,
 ) -> Leaving:  # fmt: skip
     """How often a scenario's loop leaves its corridor. `single`: what one outage does to it, where that is known."""
-    if not is_random(loop.scenario):
+    scenario = with_windows(loop.scenario, loop.steps * loop.ts)
+    parts = parts_of_traces(scenario)
+    if not is_random(scenario) and parts == 1:
         return _certain(loop, _one_lap(loop))
     laps = laps or max(_FEWEST, min(LAPS, _SLOTS // loop.steps))
-    driven = list(_laps(loop, laps, progress))
+    laps = laps if is_random(scenario) else min(laps, parts)  # further ones would be the same again
+    driven = list(_laps(loop, scenario, laps, progress))
     left, seconds = sum(lap.share > 1.0 for lap in driven), sum(lap.steps for lap in driven) * loop.ts
     chain = chain_alone(loop.scenario)
     if left < ENOUGH and chain is not None and single is not None and single.n is not None and single.n >= 0:
@@ -165,11 +169,11 @@ def _is_drawn(link: ChannelParameters) -> bool:
     return bool(((chances > 0.0) & (chances < 1.0)).any())
 
 
-def _laps(loop: LapLoop, laps: int, progress: Callable[[int], None]) -> Iterator[Lap]:
-    """Laps under the seeds from relay.seed on."""
+def _laps(loop: LapLoop, scenario: Scenario, laps: int, progress: Callable[[int], None]) -> Iterator[Lap]:
+    """Laps of a loop with the links of a scenario, under the seeds from relay.seed on."""
     drive, skipped = _prepared(loop)
     with ThreadPoolExecutor(cores()) as pool:
-        found = pool.map(lambda i: drive(loop, loop.scenario.relay.seed + i, skipped), range(laps))
+        found = pool.map(lambda i: drive(loop, scenario, scenario.relay.seed + i, skipped), range(laps))
         for done, lap in enumerate(found, start=1):
             progress(done)
             yield lap
@@ -177,10 +181,10 @@ def _laps(loop: LapLoop, laps: int, progress: Callable[[int], None]) -> Iterator
 
 def _one_lap(loop: LapLoop) -> Lap:
     drive, skipped = _prepared(loop)
-    return drive(loop, loop.scenario.relay.seed, skipped)
+    return drive(loop, loop.scenario, loop.scenario.relay.seed, skipped)
 
 
-def _prepared(loop: LapLoop) -> tuple[Callable[[LapLoop, int, int], Lap], int]:
+def _prepared(loop: LapLoop) -> tuple[Callable[[LapLoop, Scenario, int, int], Lap], int]:
     """How a lap is driven, and how many steps of it are not looked at."""
     relay = loop.scenario.relay
     loop.reference(2 * loop.steps)  # before threads ask for it
@@ -188,8 +192,8 @@ def _prepared(loop: LapLoop) -> tuple[Callable[[LapLoop, int, int], Lap], int]:
     return _direct_lap if is_direct else _simulated_lap, 0 if loop.loss_free_share < _ON_REFERENCE else loop.steps
 
 
-def _direct_lap(loop: LapLoop, seed: int, skipped: int) -> Lap:
-    scenario, steps = loop.scenario, skipped + loop.steps
+def _direct_lap(loop: LapLoop, scenario: Scenario, seed: int, skipped: int) -> Lap:
+    steps = skipped + loop.steps
     plant, relay, drawn = scenario.plant, scenario.relay, ChannelRealisation(seed, steps, loop.ts)
     inputs = RunInputs(
         numbers(drawn.outcomes(relay.uplink, "uplink")), numbers(drawn.outcomes(relay.downlink, "downlink")),
@@ -203,8 +207,7 @@ def _direct_lap(loop: LapLoop, seed: int, skipped: int) -> Lap:
     return _seen(loop, rows[skipped:, :3], reference[skipped:steps])
 
 
-def _simulated_lap(loop: LapLoop, seed: int, skipped: int) -> Lap:
-    scenario = loop.scenario
+def _simulated_lap(loop: LapLoop, scenario: Scenario, seed: int, skipped: int) -> Lap:
     plant = replace(
         scenario.plant, seed=seed, initial_pose=scenario.error_detector.track_start,
         duration=(skipped + loop.steps) * loop.ts, clock="lockstep",

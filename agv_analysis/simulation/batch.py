@@ -31,6 +31,7 @@ from agv_analysis.simulation.loop import (
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.simulation.single import settings_of, simulate, start_of, steps_of
+from agv_analysis.simulation.trace_windows import with_windows
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
 from agv_ros.parts import PartError
@@ -74,9 +75,10 @@ def simulate_batch(
     losses: their contraction says whether the loop is stable along this run.
 
     Seeds are paired: under one seed all scenarios with the same channel meet the same outages, and all AGVs the same
-    noise and slip; `relay.seed` and `plant.seed` of the scenarios do not count. `workers` threads, one a core by
-    default, do the work; the result is the same for any number. `progress` receives the number of runs done. Raises
-    UserError if a run has no end, PartError if a control law, a vehicle or a policy raises or returns NaN.
+    noise and slip; `relay.seed` and `plant.seed` of the scenarios do not count. Of a measured link with times that
+    lasts for two runs or more each seed meets another part (`trace_window`). `workers` threads, one a core by default,
+    do the work; the result is the same for any number. `progress` receives the number of runs done. Raises UserError if
+    a run has no end, PartError if a control law, a vehicle or a policy raises or returns NaN.
     """
     batch, workers, done = _Batch(scenarios, seeds, twins), workers or cores(), 0
     with ThreadPoolExecutor(workers) as pool:
@@ -101,6 +103,7 @@ class _Batch:
 
     def __init__(self, scenarios: Sequence[Scenario], seeds: Sequence[int], twins: bool) -> None:
         self.table: Table = np.zeros((len(scenarios), len(seeds)), dtype=STATISTICS)
+        scenarios = [with_windows(scenario) for scenario in scenarios]
         self._scenarios, self._seeds, self._twins = scenarios, seeds, twins
         self._steps = [steps_of(scenario) for scenario in scenarios]
         # What the runs of a scenario share, made when the first of them needs it.

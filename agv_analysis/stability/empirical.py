@@ -21,9 +21,7 @@ from agv_analysis.simulation import simulate_batch
 from agv_analysis.simulation.single import steps_of
 from agv_analysis.stability.scenario_loop import lap_of
 from agv_cloud.reference.reference import lap_steps
-from agv_plant.channels.registry import TRACE
-from agv_plant.channels.timed_trace import read_trace
-from agv_plant.parameters import ChannelParameters, RelayParameters
+from agv_plant.parameters import RelayParameters
 from agv_ros.errors import UserError
 
 LONG_ENOUGH = 0.1
@@ -90,30 +88,13 @@ def with_an_end(scenario: Scenario) -> Scenario:
     return replace(scenario, plant=replace(scenario.plant, duration=duration))
 
 
-def with_windows(scenario: Scenario) -> Scenario:
-    """The scenario with seeds that are parts of its traces with times, as long as the run, if these are longer."""
-    relay = scenario.relay
-    return replace(
-        scenario, relay=replace(relay, uplink=_windowed(scenario, "uplink"), downlink=_windowed(scenario, "downlink"))
-    )
-
-
-def _windowed(scenario: Scenario, link: str) -> ChannelParameters:
-    channel: ChannelParameters = getattr(scenario.relay, link)
-    if channel.model != TRACE or channel.trace_window > 0.0 or not math.isfinite(scenario.plant.duration):
-        return channel
-    trace, seconds = read_trace(channel.trace_file, link), scenario.plant.duration
-    is_longer = trace.time is not None and trace.length(scenario.plant.ts) >= 2.0 * seconds
-    return replace(channel, trace_window=seconds) if is_longer else channel
-
-
 def simulated_twins(scenario: Scenario, seeds: Sequence[int]) -> Twins:
     """Twins of a scenario under each seed, a micrometre and a microradian apart at first, by simulation.
 
     Of a measured link with times that is longer than the run each seed is another part. A contraction of 1e-9 or so is
     rounding: they have met. Raises UserError if the run has no end.
     """
-    runs = simulate_batch([with_windows(scenario)], seeds, twins=True)[0]
+    runs = simulate_batch([scenario], seeds, twins=True)[0]
     return Twins(
         runs["contraction"], len({run.tobytes() for run in runs}), steps_of(scenario), left_without_losses(scenario)
     )

@@ -17,7 +17,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import simulate_batch
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.stability.confidence.link_confidence import link_confidence
-from agv_analysis.stability.empirical import with_an_end, with_windows
+from agv_analysis.stability.empirical import with_an_end
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.evidence import evidence_of_scenario
 from agv_analysis.stability.scenario_loop import lap_of, loop_on_lap
@@ -156,9 +156,8 @@ def through_trace(scenario: Scenario, link: LinkOfLoop, file: Path) -> ThroughLi
             evidence, link=seen, growth=seen.growth, probability_stable=seen.probability_stable,
             n=max(longest, evidence.n),
         )  # fmt: skip
-    spread = with_windows(found)
     corridor = scenario.error_detector.corridor
-    deviations = deviations_of(spread, windows)
+    deviations = deviations_of(found, windows)
     return ThroughLink(decide(evidence), evidence.confidence, deviations, seconds, longest, corridor)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -70,3 +71,13 @@ def test_what_is_not_random_is_asked_of_one_lap() -> None:
     assert never.mean_time.value == pytest.approx(29 * 0.005)  # the 28th loss in a row leads outside
     delayed = of(0.02, "relay.uplink.model=perfect", "relay.uplink.delay=0.05", "error_detector.track=line")
     assert delayed.p_lap.low == 1.0  # v n T_s = 5 cm off for ever
+
+
+def test_laps_are_parts_of_a_long_measured_link(tmp_path: Path) -> None:
+    """Of five laps' time of a measurement the fourth holds an outage of 30 slots, which leads outside."""
+    trace = tmp_path / "link.csv"
+    trace.write_text("time,lost\n" + "".join(f"{0.05 * i:.2f},{int(700 <= i < 703)}\n" for i in range(1001)))
+    settings = ("error_detector.track=line", "relay.uplink.model=trace", f"relay.uplink.trace_file={trace}")
+    found = of(0.25, *settings)
+    assert found.method == "5 simulated laps, 1 of which left it"
+    assert np.flatnonzero(found.largest > 1.0).tolist() == [3]

@@ -20,7 +20,7 @@ from agv_analysis.cli import main
 from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.report.sweep_page import sweep_sentence
 from agv_analysis.scenario import load_scenario
-from agv_analysis.simulation import simulate_batch
+from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.sweep.borders import margins
 from agv_analysis.sweep.collect import collect
 from agv_analysis.sweep.execute import Results, on_dask, on_this_machine, run_part
@@ -219,6 +219,20 @@ def test_a_row_says_what_the_batch_does() -> None:
     assert row["iae_p50"] == np.sort(table["iae"])[4]
     assert row["peak_p95"] == np.sort(table["peak"])[8]
     assert row["unstable"] + row["undecided"] == np.count_nonzero(table["contraction"] >= 1.0)
+
+
+def test_the_seeds_of_a_sweep_are_parts_of_a_long_measured_link(tmp_path: Path) -> None:
+    """Seed s meets what was measured from s - 1 s on, as a single run does that is told to begin there."""
+    trace = tmp_path / "link.csv"
+    trace.write_text("time,lost\n" + "".join(f"{0.02 * i:.2f},{int(i % 61 < i // 20)}\n" for i in range(200)))
+    given = ("relay.uplink.model=trace", f"relay.uplink.trace_file={trace}", "plant.duration=1.0")
+    sweep = sweep_of("controller.kx=25,60", seeds=4, given=given)
+    table = run_part(sweep, sweep.parts()[0])
+    assert len({run.tobytes() for run in table[0]}) == 4
+    for seed in sweep.seeds:
+        own = ("controller.kx=25.0", "relay.uplink.trace_window=1.0", f"relay.seed={seed}")
+        alone = simulate(load_scenario(PAPER, (*given, *own)))
+        assert table[0]["final"][seed - 1] == alone.reference[-1, 1] - alone.pose[-1, 1]
 
 
 def test_runs_shorter_than_the_transient_do_not_make_a_stable_loop_unstable() -> None:
