@@ -13,6 +13,7 @@ from agv_analysis.commands import corridor_settings, with_settings, write_json
 if TYPE_CHECKING:
     from agv_analysis.requirements.link_availability import LinkAvailability
     from agv_analysis.requirements.loop_requirements import LoopRequirements
+    from agv_analysis.requirements.offered_service import OfferedService
     from agv_analysis.requirements.service_classes import ServiceClass
     from agv_analysis.scenario import Scenario
 
@@ -25,34 +26,38 @@ if TYPE_CHECKING:
 @click.option(
     "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between its packets [s], if unsaid."
 )
-@click.option("--class", "name", help="A class of service: is it met, and would it do?")
+@click.option("--class", "name", help="A class of service: is it met, would it do, and what does the loop do on it?")
 @click.option("--classes", "files", multiple=True, type=click.Path(path_type=Path), help="A file with more classes.")
 @click.option(
-    "--availability", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True), help="Asked of the link."
+    "--availability",
+    type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True),
+    help="Offered, and asked of the link.",
 )
 @click.option("--mtbf", type=click.FloatRange(min=0.0, min_open=True), help="Mean time between failures [s], likewise.")
-@click.option("--survival-time", type=click.FloatRange(min=0.0), help="Offered [s]: does the loop hold, and how fast?")
+@click.option("--survival-time", type=click.FloatRange(min=0.0), help="Offered [s], by default that of the loop.")
 @click.option("--transfer-interval", type=click.FloatRange(min=0.0, min_open=True), help="Offered with it [s].")
-@click.option("--latency", type=click.FloatRange(min=0.0), default=0.0, help="Offered with it [s].")
+@click.option("--latency", type=click.FloatRange(min=0.0), help="Offered with it [s].")
 @click.option("--table", type=click.Path(path_type=Path), help="Write tables in Markdown to this file.")
 @click.option("--report", type=click.Path(path_type=Path), help="Write a page for the browser to this file.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
 def command(
     params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
     interval: float | None, name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
-    survival_time: float | None, transfer_interval: float | None, latency: float, table: Path | None,
+    survival_time: float | None, transfer_interval: float | None, latency: float | None, table: Path | None,
     report: Path | None, json_file: Path | None,
 ) -> None:  # fmt: skip
     """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
 
-    Then what its uplink gives, or the measured link of --link, and which classes of service would do.
+    Then what its uplink gives, or the measured link of --link, and which classes of service would do. With a --class,
+    an --availability, a --mtbf or a --survival-time the inverse, too: does the loop hold on such a service, how fast
+    may it go, with which gains and sampling period, and which corridor does it keep?
 
     \b
     Examples:
       agv-ncs require config/outages.yaml --table requirements.md
       agv-ncs require config/outages.yaml --link ping.txt --availability 0.999999
       agv-ncs require config/outages.yaml --corridor 0.25 --class "mobile operation panel, emergency stop"
-      agv-ncs require config/outages.yaml --survival-time 0.05 --transfer-interval 0.01
+      agv-ncs require config/outages.yaml --availability 0.9999 --mtbf 3600 --survival-time 0.05
     """
     from rich.console import Console
 
@@ -68,14 +73,19 @@ def command(
     from agv_analysis.scenario import load_scenario
     from agv_ros.errors import UserError
 
-    if transfer_interval is not None and survival_time is None:
-        raise UserError("--transfer-interval is offered with a --survival-time: give one")
+    is_offered = name is not None or not availability is mtbf is survival_time is None
+    if transfer_interval is not None and not is_offered:
+        raise UserError(
+            "--transfer-interval is offered with a --survival-time, --availability, --mtbf or --class: give one"
+        )
     scenario = load_scenario(params, (*settings, *corridor_settings(corridor, corridor_along)))
     classes = load_classes(*files)
     if name is not None:
         classes = (find_class(name, classes),)
+    asked = () if name is None else classes
     if availability is not None or mtbf is not None:
-        classes = (*classes, _asked(availability, mtbf))
+        asked = (*asked, _asked(availability, mtbf))
+        classes = (*classes, asked[-1])
     console = Console(highlight=False)
     with Console(stderr=True).status("computing what the loop asks ..."):
         loop = require(scenario)
@@ -94,9 +104,10 @@ def command(
         "would_do_reason": {one: why for one, (_, why) in enough.items()},
         "classes": {one.name: one.source for one in classes},
     }
-    if survival_time is not None:
-        offered = _on_service(scenario, survival_time, latency, transfer_interval)
-        sections["On the offered service"], content["offered"] = offered
+    if is_offered:
+        given = _offered(loop, asked, survival_time, latency, transfer_interval)
+        with Console(stderr=True).status("asking what the loop does on the service ..."):
+            sections["On the offered service"], content["offered"] = _on_service(scenario, given)
     sections[_CLASSES] = list(rows_of_classes(classes, enough, met))
     _print(console, params, sections, loop)
     if table is not None:
@@ -159,13 +170,38 @@ def _link_of(
     return found if file is None else replace(found, assumption="the link is the channel of the line for netem")
 
 
+def _offered(
+    loop: LoopRequirements, classes: tuple[ServiceClass, ...], survival_time: float | None, latency: float | None,
+    transfer_interval: float | None,
+) -> OfferedService | str:  # fmt: skip
+    """What is offered: by the command line, where that is silent by the class named, and at last by what the loop asks.
+
+    Or why nothing can be said of it.
+    """
+    from agv_analysis.requirements.offered_service import OfferedService
+
+    def stated(figure: str) -> float | None:
+        return next((value for one in reversed(classes) if (value := getattr(one, figure)) is not None), None)
+
+    time = stated("survival_time_s") if survival_time is None else survival_time
+    if time is None:
+        time = 0.0 if loop.survival_slots is not None and loop.survival_slots < 0 else loop.survival_time
+    if time is None:
+        return f"nothing is to be asked: {loop.reasons.get('survival_time_s') or loop.infeasible}"
+    late = stated("latency_s") if latency is None else latency
+    period = stated("transfer_interval_s") if transfer_interval is None else transfer_interval
+    return OfferedService(time, late or 0.0, period, stated("availability"), stated("mtbf_s"), stated("largest_loss"))
+
+
 def _on_service(
-    scenario: Scenario, survival_time: float, latency: float, transfer_interval: float | None
-) -> tuple[list[tuple[str, ...]], dict[str, Any]]:
-    from agv_analysis.requirements.offered_service import OfferedService, on_service
+    scenario: Scenario, offered: OfferedService | str
+) -> tuple[list[tuple[str, ...]], dict[str, Any] | None]:
+    from agv_analysis.requirements.offered_service import on_service
     from agv_analysis.requirements.requirement_table import rows_of_service
 
-    found = on_service(scenario, OfferedService(survival_time, latency, transfer_interval))
+    if isinstance(offered, str):
+        return [("Does the loop hold?", offered)], None
+    found = on_service(scenario, offered)
     return list(rows_of_service(found)), found.to_json()
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agv_analysis.corridor.lap_loop import LapLoop, outage
-from agv_analysis.corridor.outage_sequences import largest_n
+from agv_analysis.corridor.outage_sequences import largest_n, worst_sequence
 from agv_analysis.corridor.single_outage import single_outage
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.scenario import Scenario
@@ -57,3 +57,8 @@ def deviation_after(scenario: Scenario, n: int) -> float:
     found, _ = loop.excursions(outage(n), max(1, loop.steps // _PLACES))
     largest = float(np.hypot(found.along, found.across).max())
     return largest if math.isfinite(largest) else math.inf
+
+
+def deviation_of_any(scenario: Scenario, n: int) -> float:
+    """Largest distance from the reference [m] that was found in sequences of outages of up to n slots; may be inf."""
+    return worst_sequence(LapLoop(scenario, Widths(1.0, math.inf, math.inf)), n).deviation

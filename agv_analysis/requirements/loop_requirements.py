@@ -37,7 +37,7 @@ _SHOWN = (0.01, 0.1)
 _DELAYS = (0.0, 0.25, 0.5, 0.75)
 """Shares of the largest delay at which the curve of losses behind a delay is computed."""
 
-_PLACES = 50
+PLACES = 50
 """Places of the lap, at least, at which the curves are asked; speeds change little from one to the next."""
 
 
@@ -220,7 +220,7 @@ def _mean_burst(scenario: Scenario, loop: LinearLoop, reasons: dict[str, str]) -
 
 def _burst(loop: LinearLoop, rate: float) -> float | None:
     """Mean burst that is taken at a loss rate: inf if any is, None if none is short enough."""
-    found = mean_square.critical_burst(loop.thinned(_PLACES), rate)
+    found = mean_square.critical_burst(loop.thinned(PLACES), rate)
     return None if found < 0.0 else found
 
 

@@ -95,15 +95,31 @@ def _share(found: Estimate) -> str:
 
 def rows_of_service(found: OnService) -> Iterator[Row]:
     """What the loop does on an offered service."""
+    offered, channel = found.offered, found.channel
+    yield "Outages while it is available", f"up to {_ms(offered.survival_time)} ({found.slots} slots)"
+    if channel.failure is not None:
+        yield (
+            "A failure lasts, on average",
+            f"{_ms(channel.failure)} longer" if math.isfinite(channel.failure) else "for ever",
+        )
+    if (offered.availability, offered.mtbf, offered.loss_rate) != (None, None, None):
+        yield "As a channel", channel.why
     yield "Does the loop hold?", f"{'yes' if found.holds else 'no'}: {found.why}"
     speed = found.speed_max
     yield "Largest speed, straight track", "no bound up to 50 m/s" if speed is None else f"{speed:.4g} m/s"
-    period = found.interval_max
-    yield "Largest transfer interval", "none" if period is None else _ms(period)
+    period, best = found.interval_max, found.interval_best
+    said = "none" if period is None else _ms(period)
+    yield "Largest transfer interval", said if best is None else f"{said}; errors die out fastest at {_ms(best)}"
     if math.isfinite(found.deviation):
         yield "Corridor that it keeps in one outage", f"{found.deviation:.3g} m"
+    if math.isfinite(found.deviation_any):
+        yield "Corridor that it keeps in any that were tried", f"{found.deviation_any:.3g} m"
+    if found.deviation_in_failure is not None and math.isfinite(found.deviation_in_failure):
+        yield "How far it goes in a failure of mean length", f"{found.deviation_in_failure:.3g} m"
     if found.kx_max is not None and found.kx_best is not None:
-        yield "K_x", f"below {found.kx_max:.4g} 1/s, {found.kx_best:.4g} 1/s is best"
+        square = found.kx_best_mean_square
+        often = "" if square is None else f", {square:.4g} 1/s in the mean square"
+        yield "K_x", f"below {found.kx_max:.4g} 1/s; {found.kx_best:.4g} 1/s is best for such outages{often}"
 
 
 def rows_of_classes(

@@ -9,15 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import agv_ncs
+from agv_analysis.cli import main
 from agv_analysis.link.age_chain import behind_constant_delay
-from agv_analysis.link.markov_channel import bernoulli, bursty
+from agv_analysis.link.markov_channel import bernoulli, bursty, gilbert_elliott
+from agv_analysis.requirements.availability import availability_of
 from agv_analysis.requirements.class_check import CANNOT_TELL, NO, YES, meets, would_do
 from agv_analysis.requirements.link_availability import of_channel
 from agv_analysis.requirements.loop_requirements import require
 from agv_analysis.requirements.loss_behind_delay import critical_loss_behind
 from agv_analysis.requirements.offered_service import OfferedService, on_service, slots_of
+from agv_analysis.requirements.service_channel import channel_of_service
 from agv_analysis.requirements.service_classes import ServiceClass, find_class, load_classes
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.stability import delayed_mean_square, floquet
@@ -86,6 +90,57 @@ def test_require_and_its_inverse_agree() -> None:
     faster, slower = (of(25.0, f"error_detector.speed={speed * factor}") for factor in (1.01, 0.99))
     assert require(slower).survival_slots == 14
     assert (require(faster).survival_slots or 0) < 14
+
+
+def test_the_channel_of_a_service_has_its_figures() -> None:
+    """Availability and mean time between failures of a channel, and the channel of these, for loops that survive n."""
+    for p, r, n in ((1e-3, 0.1, 0), (0.02, 0.2, 14), (1e-4, 1.0 / 120.0, 3), (0.3, 0.9, 2), (0.5, 1.0, 0)):
+        given = availability_of(gilbert_elliott(p, r), n, 0.005)
+        found = channel_of_service(given.availability, given.mtbf, n, 0.005)
+        assert found.chain is not None, found.why
+        assert found.chain.transition == pytest.approx(np.array([[1.0 - p, p], [r, 1.0 - r]]), rel=1e-6)
+        assert found.failure == pytest.approx(0.005 / r)
+    for p, n in ((1e-2, 2), (0.5, 14), (0.9, 0)):
+        given = availability_of(bernoulli(p), n, 0.005)
+        for availability, mtbf in ((given.availability, None), (None, given.mtbf)):
+            chain = channel_of_service(availability, mtbf, n, 0.005).chain
+            assert chain is not None
+            assert chain.loss_rate == pytest.approx(p, rel=1e-6)
+    # A failure of 0.86 ms is shorter than a slot; and outages of 14 slots before each leave no half of the time for it.
+    assert "would last 0.864 ms" in channel_of_service(0.99999999, 86400.0, 3, 0.005).why
+    assert channel_of_service(0.5, 0.1, 14, 0.005).chain is None
+    assert channel_of_service(None, None, 14, 0.005).chain is None
+
+
+def test_the_inverse_knows_the_border_of_bursts_that_require_prints() -> None:
+    """A service that fails as the critical Gilbert channel: a hair milder the loop holds, a hair worse it does not."""
+    scenario = of(25.0, "error_detector.speed=1.0")
+    border = dict(require(scenario).bursts)[0.1]
+    assert border is not None
+    for factor, holds in ((0.98, True), (1.02, False)):
+        link = availability_of(bursty(0.1, border * factor), 2, 0.005)
+        found = on_service(scenario, OfferedService(0.01, availability=link.availability, mtbf=link.mtbf))
+        assert (found.holds, found.mean_square) == (holds, holds), found.why
+        assert found.channel.failure == pytest.approx(border * factor * 0.005)
+        assert found.slots == 2
+    assert "make the mean square of the error grow" in found.why
+    assert found.deviation < found.deviation_in_failure if found.deviation_in_failure is not None else False
+
+
+def test_the_best_sampling_period_is_one_that_holds_and_none_is_better() -> None:
+    """Along a line the worst of the outages within 50 ms leaves |1 - a L|, L <= n + 1, of an error: in closed form."""
+    scenario = of(25.0)
+    found = on_service(scenario, OfferedService(0.05))
+    assert found.interval_best is not None
+    assert found.interval_max is not None
+
+    def growth(ts: float) -> float:
+        L = np.arange(1, slots_of(0.05, ts) + 2)
+        return float((np.log(np.maximum(np.abs(1.0 - 25.0 * ts * L), 1e-12)) / L).max() / ts)
+
+    periods = np.geomspace(0.005 / 8.0, found.interval_max, 40)
+    across = -1.0  # poles at 1/s across the line: no period is faster than these
+    assert max(growth(found.interval_best), across) <= min(max(growth(ts), across) for ts in periods) + 0.05
 
 
 def test_a_latency_that_is_offered_too() -> None:
@@ -157,8 +212,8 @@ def test_a_corridor_shortens_the_survival_time() -> None:
 def test_every_row_has_a_source() -> None:
     for one in load_classes():
         assert one.document
-        assert one.read
-        assert "version" in one.source
+        assert one.read or "not read in the document" in one.source
+        assert one.version in one.source or "version not recorded" in one.source
 
 
 def test_a_row_without_a_source_is_refused(tmp_path: Path) -> None:
@@ -221,6 +276,24 @@ def test_what_the_command_says(tmp_path: Path, agv_ncs: AgvNcs) -> None:
     assert content["offered"]["holds"] is True
     assert "70 ms (14 slots)" in said
     assert "| Survival time, by stability | 70 ms (14 slots) |" in table.read_text()
+    offered = content["offered"]
+    assert (offered["mtbf_s"], offered["latency_s"], offered["survival_slots"]) == (10000.0, 0.0, 4)
+    p = offered["channel"]["loss_rate"]
+    assert 0.005 * (1 - p**5) / ((1 - p) * p**5) == pytest.approx(10000.0)
+    assert offered["mean_square"] is True
     html = page.read_text()
     assert "Every 5 ms a message; outages of 70 ms at most, or a latency of 60.29 ms" in html
     assert 'id="plot-bursts"' in html
+
+
+def test_a_class_is_what_is_offered(tmp_path: Path) -> None:
+    """Its latency and losses, and where it has no survival time that of the loop."""
+    found, params = tmp_path / "found.json", str(REPOSITORY / "config/paper.yaml")
+    settings = ("--set", "error_detector.track=line", "--set", "error_detector.speed=1.0")
+    answer = CliRunner().invoke(main, ["require", params, *settings, "--class", "5QI 82", "--json", str(found)])
+    assert answer.exit_code == 0, answer.output
+    offered = json.loads(found.read_text())["offered"]
+    assert (offered["survival_slots"], offered["latency_s"], offered["holds"]) == (14, 0.01, True)
+    assert offered["channel"]["loss_rate"] == pytest.approx(1e-4)
+    answer = CliRunner().invoke(main, ["require", params, "--transfer-interval", "0.01"])
+    assert (answer.exit_code, "is offered with a --survival-time, --availability" in answer.output) == (1, True)
