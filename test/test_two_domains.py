@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -112,35 +111,6 @@ def test_neither_side_sees_the_others_topics(two_domains: Domains) -> None:
 
 
 # -- two hosts ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def two_hosts() -> Iterator[tuple[list[str], list[str]]]:
-    """Commands' beginnings that run them on two hosts, which are network namespaces joined by a cable."""
-    if shutil.which("ip") is None or os.geteuid() != 0:
-        pytest.skip("two network namespaces need root and iproute2")
-    names = [f"agv_ncs_{os.getpid()}_{side}" for side in ("agv", "edge")]
-    ends = [f"v{os.getpid()}{side}" for side in "ae"]
-
-    def ip(*arguments: str) -> None:
-        subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)
-
-    try:
-        try:
-            for name in names:
-                ip("netns", "add", name)
-            ip("link", "add", ends[0], "netns", names[0], "type", "veth", "peer", "name", ends[1], "netns", names[1])
-            for host, (name, end) in enumerate(zip(names, ends, strict=True), start=1):
-                ip("-n", name, "address", "add", f"10.213.0.{host}/24", "dev", end)
-                for link in ("lo", end):
-                    ip("-n", name, "link", "set", link, "up")
-                ip("-n", name, "route", "add", "default", "dev", end)  # where multicast goes
-        except subprocess.CalledProcessError as error:
-            pytest.skip(f"this machine allows no network namespaces: {error.stderr.strip()}")
-        yield ["ip", "netns", "exec", names[0]], ["ip", "netns", "exec", names[1]]
-    finally:
-        for name in names:
-            subprocess.run(["ip", "netns", "delete", name], check=False, capture_output=True)
 
 
 def test_edge_and_agv_on_two_hosts(two_hosts: tuple[list[str], list[str]], two_domains: Domains) -> None:

@@ -1,4 +1,4 @@
-"""The link from both ends: real sockets on loopback, a relay that loses what it is told to, two network namespaces."""
+"""The link from both ends: real sockets on loopback, a relay that loses what it is told to, two hosts on a cable."""
 
 from __future__ import annotations
 
@@ -161,63 +161,88 @@ def test_rate_and_size_are_bounded(more: dict[str, float], complaint: str) -> No
         measure("127.0.0.1", 9, **more)  # type: ignore[arg-type]
 
 
-def _namespaces_with_netem() -> str:
-    """Why two network namespaces with netem cannot be had here; empty if they can."""
-    if os.geteuid() != 0 or not (shutil.which("ip") and shutil.which("tc")):
-        return "needs root, ip and tc"
-    made = subprocess.run(["ip", "netns", "add", "agvprobe0"], capture_output=True, text=True)
-    if made.returncode:
-        return f"needs network namespaces: {made.stderr.strip()}"
-    try:
-        enter = ["ip", "netns", "exec", "agvprobe0"]
-        asked = [*enter, "tc", "qdisc", "add", "dev", "lo", "root", "netem", "loss", "1%"]
-        tried = subprocess.run(asked, capture_output=True, text=True)
-        return f"needs netem in the kernel: {tried.stderr.strip()}" if tried.returncode else ""
-    finally:
-        subprocess.run(["ip", "netns", "del", "agvprobe0"], check=False)
+# -- two hosts ---------------------------------------------------------------------------------------------------------
+
+Hosts = tuple[list[str], list[str]]
+"""Commands' beginnings that run them on the AGV's host and on the edge's."""
 
 
-def test_two_network_namespaces_with_netem(tmp_path: Path) -> None:
-    reason = _namespaces_with_netem()
-    if reason:
-        pytest.skip(reason)
+def on(host: list[str], *words: str) -> None:
+    """Run a command there; the test is skipped, with the reason, where the machine has no such thing."""
+    done = subprocess.run([*host, *words], capture_output=True, text=True)
+    if done.returncode:
+        pytest.skip(f"{' '.join(words[:6])}: {done.stderr.strip()}")
 
-    def run(*words: str) -> None:
-        subprocess.run(words, check=True, capture_output=True)
 
-    ends = (("agvprobe1", "agvp1", "10.213.7.1/24"), ("agvprobe2", "agvp2", "10.213.7.2/24"))
+def cable(host: list[str]) -> str:
+    """The device at a host's end of the cable."""
+    shown = subprocess.run([*host, "ip", "-o", "link"], capture_output=True, text=True, check=True).stdout
+    return next(line.split(": ")[1].split("@")[0] for line in shown.splitlines() if "@" in line)
+
+
+def lose(host: list[str], kind: int, low: int) -> None:
+    """From here on a host gets no messages of a kind with packet numbers that end in the byte `low`."""
+    if shutil.which("tc") is None:
+        pytest.skip("needs tc")
+    device = cable(host)
+    on(host, "ip", "link", "add", "nowhere", "type", "veth", "peer", "name", "further")
+    on(host, "ip", "link", "set", "nowhere", "up")
+    on(host, "tc", "qdisc", "add", "dev", device, "ingress")
+    payload = 20 + 8  # behind the headers of IP and UDP
+    match = [
+        word
+        for place, value in ((payload + 4, kind), (payload + 24, low))
+        for word in ("match", "u8", hex(value), "0xff", "at", str(place))
+    ]
+    away = ("action", "mirred", "egress", "redirect", "dev", "nowhere")
+    on(host, "tc", "filter", "add", "dev", device, "parent", "ffff:", "protocol", "ip", "u32", *match, *away)
+
+
+def probed(hosts: Hosts, path: Path, duration: float) -> Measurement:
+    """What the command measures from one host to the other."""
+    agv, edge = hosts
     cli = [sys.executable, "-m", "agv_analysis.cli", "probe"]
+    listener = subprocess.Popen([*edge, *cli, "--listen", "--seconds", "60"], stdout=subprocess.PIPE)
     try:
-        for name, _, _ in ends:
-            run("ip", "netns", "add", name)
-        run("ip", "link", "add", "agvp1", "netns", "agvprobe1", "type", "veth", "peer", "agvp2", "netns", "agvprobe2")
-        for name, link, address in ends:
-            run("ip", "-n", name, "addr", "add", address, "dev", link)
-            run("ip", "-n", name, "link", "set", link, "up")
-        enter = ["ip", "netns", "exec", "agvprobe1"]
-        run(*enter, "tc", "qdisc", "add", "dev", "agvp1", "root", "netem", "delay", "20ms", "loss", "20%")
-        edge = subprocess.Popen(
-            ["ip", "netns", "exec", "agvprobe2", *cli, "--listen", "--seconds", "60"], stdout=subprocess.PIPE
-        )
-        try:
-            assert edge.stdout is not None
-            assert b"listening" in edge.stdout.readline()
-            path = tmp_path / "link.csv"
-            run(*enter, *cli, "10.213.7.2", "--duration", "4", "--interval", "0.002", "--trace", str(path))
-        finally:
-            edge.terminate()
-            edge.wait()
-        found = read_link(path)
-        assert isinstance(found, Measurement)
-        figures = LinkFigures(found).to_json()
-        assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(0.2, abs=0.06)
-        assert figures["downlink"]["loss_rate"]["value"] < 0.01
-        assert figures["uplink"]["delay"]["p50_s"] + figures["downlink"]["delay"]["p50_s"] == pytest.approx(
-            0.02, abs=0.01
-        )
+        assert listener.stdout is not None
+        assert b"listening" in listener.stdout.readline()
+        words = ("10.213.0.2", "--duration", str(duration), "--interval", "0.002", "--trace", str(path))
+        subprocess.run([*agv, *cli, *words], check=True, capture_output=True)
     finally:
-        for name, _, _ in ends:
-            subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
+        listener.terminate()
+        listener.communicate()
+    found = read_link(path)
+    assert isinstance(found, Measurement)
+    return found
+
+
+def test_between_two_hosts_what_the_kernel_drops_is_known_exactly(two_hosts: Hosts, tmp_path: Path) -> None:
+    lose(two_hosts[1], PACKET, 7)
+    lose(two_hosts[0], ANSWER, 9)
+    found = probed(two_hosts, tmp_path / "link.csv", 1.2)
+    assert found.packets == 600
+    assert found.uplink is not None
+    assert found.downlink is not None
+    assert np.flatnonzero(found.uplink.lost).tolist() == [7, 263, 519]
+    assert np.flatnonzero(found.downlink.lost).tolist() == [9, 265, 521]
+    figures = LinkFigures(found).to_json()
+    assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(3 / 600)
+    assert figures["downlink"]["loss_rate"]["value"] == pytest.approx(3 / 597)
+
+
+def test_between_two_hosts_with_netem(two_hosts: Hosts, tmp_path: Path) -> None:
+    if shutil.which("tc") is None:
+        pytest.skip("needs tc")
+    agv = two_hosts[0]
+    on(agv, "tc", "qdisc", "add", "dev", cable(agv), "root", "netem", "delay", "20ms", "loss", "20%")
+    figures = LinkFigures(probed(two_hosts, tmp_path / "link.csv", 4.0)).to_json()
+    assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(0.2, abs=0.06)
+    assert figures["downlink"]["loss_rate"]["value"] < 0.01
+    both = figures["uplink"]["delay"]["p50_s"] + figures["downlink"]["delay"]["p50_s"]
+    assert both == pytest.approx(0.02, abs=0.01)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
 
 
 def test_the_command(tmp_path: Path, agv_ncs: AgvNcs) -> None:
