@@ -91,10 +91,6 @@ class _Rows:
         is_row = np.bincount(lines, minlength=len(block.starts)) == count
         is_row[: max(0, self.header.line + 1 - block.number)] = False
         is_row &= text[block.starts] != ord("#")
-        for i in np.flatnonzero(~is_row).tolist():
-            line = block.line(i)
-            if block.number + i > self.header.line and line.strip() and not line.startswith(b"#"):
-                self.malformed.add(block.number + i, line)
         rows = np.flatnonzero(is_row)
         ends = ends_of_cells[is_row[lines]].reshape(-1, count)
         begins = np.concatenate((block.starts[rows][:, None], ends[:, :-1] + 1), axis=1)
@@ -105,8 +101,11 @@ class _Rows:
             cells = trimmed(text, begins[:, column.place], ends[:, column.place])
             found[column.role], fine = self._values(text, *cells, column)
             good &= fine
-        for i in rows[~good].tolist():
-            self.malformed.add(block.number + i, block.line(i))
+        is_row[rows[~good]] = False
+        for i in np.flatnonzero(~is_row).tolist():
+            line = block.line(i)
+            if block.number + i > self.header.line and line.strip() and not line.startswith(b"#"):
+                self.malformed.add(block.number + i, line)
         return {role: values[good] for role, values in found.items()}
 
     def _values(
@@ -114,7 +113,7 @@ class _Rows:
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """The cells of a column as numbers, NaN for an empty one, and which of them are in order."""
         if column.role in INSTANTS and self._is_dated(text, begins, ends, column.role):
-            values, good = dates_at(text, begins, ends)
+            values, good = dates_at(text, begins, ends, self.header.may_have_commas)
             return values, good | (begins == ends)
         read = flags_at if column.role in FLAGS else floats_at
         values, good = read(text, begins, ends, self.header.may_have_commas)

@@ -129,11 +129,10 @@ def _batches(path: Path, progress: Progress | None, malformed: Malformed, stated
 
 
 def _end(text: bytes) -> int | None:
-    """Where the list ends: at a bracket behind a member, or behind none."""
+    """Where the list of members ends: at the first closing bracket that closes none of their own."""
     at = -1
     while (at := text.find(b"]", at + 1)) >= 0:
-        before = text[max(0, at - 256) : at].rstrip(b" \t\r\n,")
-        if not before or before.endswith(b"}"):
+        if text.count(b"[", 0, at) == text.count(b"]", 0, at):
             return at
     return None
 

@@ -60,7 +60,7 @@ def is_date(text: Bytes, begins: Places, ends: Places) -> Flags:
     return np.asarray(found)
 
 
-def dates_at(text: Bytes, begins: Places, ends: Places) -> tuple[Floats, Flags]:
+def dates_at(text: Bytes, begins: Places, ends: Places, commas: bool = False) -> tuple[Floats, Flags]:
     """Dates of ISO 8601 with a time, as 2024-05-01T12:00:00.25+02:00, in seconds since 1970, and which are some.
 
     Without a zone they are taken as they stand: only their differences matter.
@@ -81,7 +81,7 @@ def dates_at(text: Bytes, begins: Places, ends: Places) -> tuple[Floats, Flags]:
     is_real = (month >= 1) & (month <= 12) & (day >= 1) & (day <= 31) & (year >= 1)
     stated, inverse = np.unique((year * 12 + np.maximum(month, 1) - 1), return_inverse=True)
     days = (stated - 1970 * 12).astype("datetime64[M]").astype("datetime64[D]").astype(np.int64)[inverse] + day - 1
-    seconds = numbers_at(text, at + len(_DATE), commas=True)
+    seconds = numbers_at(text, at + len(_DATE), commas)
     behind = at + len(_DATE) + seconds.length
     zone, whole = _zones(text, behind, ends[good])
     is_real &= whole & (seconds.length >= 2)

@@ -1,0 +1,270 @@
+"""What the formats look like in the wild: other tools, languages and clocks, spreadsheets; cut off, half filled."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from agv_analysis.link.formats import format_of, read_link
+from agv_analysis.link.formats.format import Options
+from agv_analysis.link.measurement import LOST, NOT_SENT, RECEIVED, UNKNOWN, Measurement, MeasurementError
+
+NAN = float("nan")
+
+
+def read(path: Path, text: str, options: Options | None = None) -> Measurement:
+    path.write_text(text, encoding="utf-8")
+    found = read_link(path, options)
+    assert isinstance(found, Measurement)
+    return found
+
+
+def delays(found: Measurement) -> list[float]:
+    assert found.whole.delay is not None
+    return [float(value) for value in found.whole.delay]
+
+
+def lost(found: Measurement) -> list[int]:
+    return [int(i) for i in np.flatnonzero(found.whole.lost)]
+
+
+def said(found: Measurement) -> str:
+    return " ".join((*found.notes, *found.malformed.sentences()))
+
+
+# -- ping --------------------------------------------------------------------------------------------------------------
+
+
+def test_ping_of_ipv6_on_linux_and_on_the_bsds(tmp_path: Path) -> None:
+    linux = (
+        "PING fe80::1%eth0(fe80::1%eth0) 56 data bytes\n"
+        "64 bytes from fe80::1%eth0: icmp_seq=1 ttl=64 time=0.25 ms\n"
+        "64 bytes from host (2001:db8::1): icmp_seq=3 ttl=57 time=12 ms\n"
+    )
+    found = read(tmp_path / "a", linux)
+    assert (lost(found), found.malformed.count) == ([1], 0)
+    assert delays(found) == pytest.approx([0.00025, NAN, 0.012], nan_ok=True)
+    bsd = (
+        "PING6(56=40+8+8 bytes) ::1 --> ::1\n16 bytes from ::1, icmp_seq=0 hlim=64 time=0.059 ms\n"
+        "Request timeout for icmp_seq 1\n16 bytes from ::1, icmp_seq=2 hlim=64 time=0.061 ms\n\n"
+        "--- ::1 ping6 statistics ---\n3 packets transmitted, 2 packets received, 33.3% packet loss\n"
+        "round-trip min/avg/max/std-dev = 0.059/0.060/0.061/0.001 ms\n"
+    )
+    found = read(tmp_path / "b", bsd)
+    assert (lost(found), found.malformed.count, found.packets) == ([1], 0, 3)
+    assert delays(found)[0] == pytest.approx(59e-6)
+
+
+def test_ping_with_decimal_commas_and_in_another_language(tmp_path: Path) -> None:
+    found = read(
+        tmp_path / "a",
+        "PING x (1.2.3.4) 56(84) Bytes an Daten.\n[1700000000,500000] 64 Bytes von 1.2.3.4: icmp_seq=1 ttl=64 "
+        "Zeit=1,25 ms\n[1700000001,500000] noch keine Antwort f\xfcr icmp_seq=2\n"
+        "[1700000002,750000] 64 Bytes von 1.2.3.4: icmp_seq=3 ttl=64 Zeit=250 ms\n",
+    )
+    assert (lost(found), found.malformed.count) == ([1], 0)
+    assert delays(found) == pytest.approx([0.00125, NAN, 0.25], nan_ok=True)
+    assert found.span == pytest.approx(2.00125)  # stamps less the round trip
+
+
+def test_ping_that_was_cut_at_its_beginning_and_in_a_number(tmp_path: Path) -> None:
+    found = read(
+        tmp_path / "a",
+        " from 1.2.3.4: icmp_seq=40 ttl=64 time=1.0 ms\n64 bytes from 1.2.3.4: icmp_seq=41 ttl=64 time=1.0 ms\n"
+        "64 bytes from 1.2.3.4: icmp_seq=42 ttl=64 time=1.0 ms\n64 bytes from 1.2.3.4: icmp_seq=4",
+    )
+    assert (found.packets, lost(found), found.malformed.count, found.duplicates) == (2, [], 2, 0)
+    assert "line 1: 'from 1.2.3.4: icmp_seq=40" in said(found)
+    assert "the beginning of the log is missing" in said(found)
+
+
+def test_ping_with_all_that_may_be_on_its_lines(tmp_path: Path) -> None:
+    found = read(
+        tmp_path / "a",
+        "PING x (1.2.3.4) 56(84) bytes of data.\n"
+        "64 bytes from 1.2.3.4: icmp_seq=1 ttl=64 time<1 ms\n"
+        "64 bytes from 1.2.3.4: icmp_seq=1 ttl=64 time=3.0 ms (DUP!)\n"
+        "8 bytes from 1.2.3.4: icmp_seq=2 ttl=64 (truncated)\n"
+        "From 10.0.0.1: icmp_seq=3 Redirect Host(New nexthop: 10.0.0.9)\n"
+        "64 bytes from 1.2.3.4: icmp_seq=3 ttl=64 time=2.0 ms\n"
+        "wrong data byte #16 should be 0x10 but was 0x11\n"
+        "From 10.0.0.1 icmp_seq=4 Time to live exceeded\n"
+        "ping: sendmsg: Network is unreachable\n"
+        "64 bytes from 1.2.3.4: icmp_seq=6 ttl=64 time=2.0 ms\n"
+        "something else\n",
+    )
+    assert (lost(found), found.duplicates, found.malformed.shown) == ([3, 4], 1, ["line 11: 'something else'"])
+    assert delays(found) == pytest.approx([0.001, NAN, 0.002, NAN, NAN, 0.002], nan_ok=True)
+    assert "1 replies took less than the time that is printed" in said(found)
+
+
+def test_two_runs_of_ping_in_one_file_are_refused(tmp_path: Path) -> None:
+    run = "PING x (1.2.3.4) 56(84) bytes of data.\n64 bytes from 1.2.3.4: icmp_seq=1 ttl=64 time=1.0 ms\n\n"
+    with pytest.raises(MeasurementError, match=r"a:4: another run begins: give each run of ping its own file"):
+        read(tmp_path / "a", run + run)
+
+
+def test_numbers_of_ping_come_out_of_order_where_they_begin_anew(tmp_path: Path) -> None:
+    numbers = [65533, 65535, 0, 65534, 1, 3]
+    found = read(tmp_path / "a", "".join(f"64 bytes from 1.2.3.4: icmp_seq={n} ttl=64 time=1.0 ms\n" for n in numbers))
+    assert (found.packets, lost(found), found.reordered, found.duplicates) == (7, [5], 1, 0)
+
+
+# -- irtt --------------------------------------------------------------------------------------------------------------
+
+
+def irtt(trips: list[object], tail: str = "]}", params: str = '"interval": 20000000') -> str:
+    members = ", ".join(trip if isinstance(trip, str) else json.dumps(trip) for trip in trips)
+    return f'{{"config": {{"params": {{{params}}}}}, "round_trips": [{members}{tail}'
+
+
+def test_irtt_with_fields_that_are_missing(tmp_path: Path) -> None:
+    trips: list[object] = [
+        {"seqno": 0, "lost": "false", "delay": {"rtt": 5_000_000}},
+        {"seqno": 1, "lost": "true_up"},
+        {"seqno": 2, "lost": True, "delay": None, "timestamps": None},
+        {"seqno": 3, "delay": {"rtt": 6_000_000, "send": None}},
+        {"seqno": 4},
+        {"seqno": 5, "lost": "TRUE_DOWN", "delay": {"send": 2_000_000}, "extra": [1, {"a": []}]},
+    ]
+    found = read(tmp_path / "a", irtt(trips))
+    assert found.uplink is not None
+    assert found.downlink is not None
+    assert found.whole.outcome.tolist() == [RECEIVED, LOST, LOST, RECEIVED, UNKNOWN, LOST]
+    assert found.uplink.outcome.tolist() == [RECEIVED, LOST, UNKNOWN, RECEIVED, UNKNOWN, RECEIVED]
+    assert found.downlink.outcome.tolist() == [RECEIVED, NOT_SENT, UNKNOWN, RECEIVED, UNKNOWN, LOST]
+    assert found.sent.tolist() == pytest.approx([0.02 * i for i in range(6)])
+    assert found.uplink.delay is not None
+    assert found.uplink.delay[5] == pytest.approx(0.002)
+    for sentence in ("of 1 lost packets irtt does not know on which way", "of 1 packets the file does not say",
+                     "they are dated by their numbers"):  # fmt: skip
+        assert sentence in said(found)
+
+
+def test_irtt_with_members_that_are_broken_keeps_the_others(tmp_path: Path) -> None:
+    good = [{"seqno": i, "lost": "false", "delay": {"rtt": 1_000_000 + i}} for i in range(6)]
+    trips: list[object] = [*good[:2], '{"seqno": 2, "lost": fal', good[3], {"seqno": "4"}, {"lost": "false"}, good[5]]
+    found = read(tmp_path / "a", irtt(trips).replace("fal,", "fal},"))
+    assert found.malformed.count == 3
+    assert found.packets == 4
+    assert "2 numbers are missing from the file" in said(found)
+    assert delays(found) == pytest.approx([0.001, 0.001000001, 0.001000003, 0.001000005])
+
+
+def test_irtt_reads_the_same_with_and_without_msgspec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from agv_analysis.link.formats import irtt_json
+
+    stamp = {"client": {"send": {"wall": 17 * 10**17, "monotonic": 10**9}, "receive": {}}, "server": {}}
+    trips: list[object] = [
+        {"seqno": i, "lost": ("false", "true", "true_up", "true_down")[i % 4], "timestamps": stamp,
+         "delay": {"rtt": 5_000_000 + i, "send": 3_000_000, "receive": 2_000_000}}
+        for i in range(500)
+    ]  # fmt: skip
+    pytest.importorskip("msgspec")
+    fast = read(tmp_path / "a", irtt(trips))
+    monkeypatch.setattr(irtt_json, "_decoder", lambda: irtt_json._decode_as_json)
+    slow = read(tmp_path / "a", irtt(trips))
+    assert fast.notes == slow.notes
+    for one, other in zip(
+        (fast.uplink, fast.downlink, fast.whole), (slow.uplink, slow.downlink, slow.whole), strict=True
+    ):
+        assert one is not None
+        assert other is not None
+        assert one.outcome.tolist() == other.outcome.tolist()
+        np.testing.assert_array_equal(one.delay, other.delay)
+
+
+def test_irtt_whose_members_are_longer_than_what_is_read_at_a_time(tmp_path: Path) -> None:
+    trips: list[object] = [{"seqno": i, "lost": "false", "note": "x" * 100_000, "delay": {"rtt": i}} for i in range(5)]
+    found = read(tmp_path / "a", irtt(trips))
+    assert (found.packets, found.malformed.count) == (5, 0)
+
+
+# -- owping ------------------------------------------------------------------------------------------------------------
+
+
+def test_owping_without_a_time_to_live_and_out_of_order(tmp_path: Path) -> None:
+    base, second = 3_900_000_000 << 32, 1 << 32
+    rows = [(0, 0.0, 0.010), (2, 0.2, 0.215), (1, 0.1, 0.230), (3, 0.3, None), (2, 0.2, 0.240)]
+    text = "".join(
+        f"{n} {base + round(sent * second)} 1 1.2e-05 {0 if at is None else base + round(at * second)} 1 1.3e-05\n"
+        for n, sent, at in rows
+    )
+    found = read(tmp_path / "a", text + "4 garbage\n")
+    assert (lost(found), found.reordered, found.duplicates, found.malformed.count) == ([3], 1, 1, 1)
+    assert delays(found) == pytest.approx([0.01, 0.13, 0.015, NAN], nan_ok=True, abs=1e-9)
+
+
+# -- tables ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Zeit;Time [s];RTT (ms);lost\nx;0,00;12,5;0\nx;0,02;;1\nx;0,04;7;0\n",
+        "# made by hand\ntime_s\trtt in us\n0\t12500\n# a remark\n0.02\ttimeout\n0.04\t7000\n",
+        'time,rtt/s\r\n"2024-05-01T12:00:00Z","0.0125"\r\n"2024-05-01T12:00:00.02Z",""\r\n"2024-05-01T12:00:00.040Z","7e-3"\r\n',
+        "timestamp|RTT [msec]|verdict\n2024-05-01 23:59:59.98+02:00|12.5|delivered\n"
+        "2024-05-01 22:00:00|*|lost\n2024-05-02T00:00:00.02+0200|7.0|delivered\n",
+        "\ufeffdate;rtt_ms\n2024-02-29 23:59:59,98;12,5\n2024-03-01 00:00:00,00;nan\n2024-03-01 00:00:00,02;7,0\n",
+    ],
+)
+def test_tables_of_spreadsheets_and_scripts(tmp_path: Path, text: str) -> None:
+    found = read(tmp_path / "a", text)
+    assert (found.format, found.malformed.count, lost(found)) == ("table", 0, [1])
+    assert delays(found) == pytest.approx([0.0125, NAN, 0.007], nan_ok=True)
+    assert found.sent.tolist() == pytest.approx([0.0, 0.02, 0.04], abs=1e-6)
+    assert ("commas are taken for decimal marks" in said(found)) == (";" in text.splitlines()[0])
+
+
+def test_rows_of_a_table_that_are_none_are_named(tmp_path: Path) -> None:
+    text = "time;rtt_ms\n0,0;1,5\n0,02;1.234,5\n2024-05-01T12:00:00;1\n0,04\n0,06;2,5\n0,08;x\n"
+    found = read(tmp_path / "a", text)
+    assert found.packets == 2
+    assert found.malformed.shown == ["line 3: '0,02;1.234,5'", "line 4: '2024-05-01T12:00:00;1'", "line 5: '0,04'"]
+    assert found.malformed.count == 4
+    dates = "time,rtt\n2024-05-01T12:00:00,0.1\n2024-13-01T12:00:00,0.1\n5.0,0.1\n2024-05-01T12:00:01,0.1\n"
+    found = read(tmp_path / "b", dates)
+    assert (found.packets, found.span, found.malformed.count) == (2, 1.0, 2)
+
+
+def test_numbers_of_a_table_begin_anew_and_may_be_missing(tmp_path: Path) -> None:
+    rows = [(n % 65536, 0.01 * n) for n in range(65530, 65545) if n not in (65533, 65537)]
+    found = read(tmp_path / "a", "seq,time\n" + "".join(f"{n},{t:.2f}\n" for n, t in rows))
+    assert (found.packets, lost(found)) == (15, [3, 7])
+    assert found.interval == pytest.approx(0.01)
+    far = read(tmp_path / "b", "seq,time\n5,0\n40000,399.95\n")  # an outage, and no new beginning
+    assert (far.packets, int(far.whole.lost.sum())) == (39996, 39994)
+    flags = read(tmp_path / "c", "seq,lost\n1,0\n2,1\n5,0\n")
+    assert flags.packets == 3
+    assert "numbers are missing in 1 places" in said(flags)
+
+
+# -- mahimahi, iperf3, what is none ------------------------------------------------------------------------------------
+
+
+def test_mahimahi_with_several_opportunities_a_millisecond(tmp_path: Path) -> None:
+    found = read(tmp_path / "a", "0\n0\n5\n5\n5\n30\n", Options(interval=0.01))
+    assert found.format == "mahimahi"
+    assert delays(found) == pytest.approx([0.0, 0.02, 0.01])
+
+
+@pytest.mark.parametrize(
+    "text", ["PING\n", "1,2,3\n4,5,6\n", '{"round_trips": 3}', "a;b\n1;2\n", "0\n", "\x00\x01\x02"]
+)
+def test_what_is_none_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a").write_text(text)
+    with pytest.raises(MeasurementError):
+        read_link(tmp_path / "a")
+
+
+def test_formats_are_told_apart(tmp_path: Path) -> None:
+    for text, name in (
+        ("16 bytes from ::1, icmp_seq=0 hlim=64 time=0.059 ms\n", "ping"), ("date;rtt_ms\n", "table"),
+        ('{\n  "round_trips": [\n', "irtt"), ("0\n5\n9\n", "mahimahi"), ("loss random 5%\n", "netem"),
+    ):  # fmt: skip
+        (tmp_path / "a").write_text(text)
+        assert format_of(tmp_path / "a").name == name
