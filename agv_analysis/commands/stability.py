@@ -68,6 +68,8 @@ def command(
       agv-ncs stability config/outages.yaml --set error_detector.track=eight --corridor 0.25 --confidence 0.95
       agv-ncs stability config/paper.yaml --map kx,ts --csv map.csv --picture map.png
     """
+    from concurrent.futures import ThreadPoolExecutor
+
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -89,7 +91,12 @@ def command(
         return
     console = Console(highlight=False)
     seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
-    with Console(stderr=True).status("computing the margins ...") as status:
+    with Console(stderr=True).status("computing the margins ...") as status, ThreadPoolExecutor(1) as beside:
+
+        def within_corridor(what: str) -> None:
+            status.update(f"within the corridor: {what} ...")
+
+        within_it = beside.submit(corridor, scenario, laps, within_corridor)
         found, run = margins(scenario), with_an_end(scenario)
         twins = simulated_twins(run, seeds)
         status.update("simulating twins under more and more losses ...")
@@ -97,11 +104,7 @@ def command(
         found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
         evidence = evidence_of_scenario(scenario, twins.evidence)
         verdict = decide(evidence)
-
-        def within_corridor(what: str) -> None:
-            status.update(f"within the corridor: {what} ...")
-
-        within = corridor(scenario, laps, within_corridor)
+        within = within_it.result()
         kept = None if confidence is None else kept_with_confidence(scenario, confidence, laps, within_corridor)
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")

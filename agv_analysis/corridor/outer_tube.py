@@ -28,13 +28,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.corridor.lap_loop import LapLoop, outage
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.products import assign, multiply
+from agv_analysis.stability.products import assign, multiply, of_size_3
 from agv_analysis.stability.reception_maps import burst_maps
 
 _SIDES, _SIDES_OF_LONG = 32, 16
@@ -135,10 +136,10 @@ def applies_to(linear: LinearLoop) -> bool:
 
 def outer_tube(loop: LapLoop, linear: LinearLoop, n: int) -> Tube | None:
     """The tube for outages of up to `n` slots; None where it grows out of the corridor, or for ever."""
-    bias, nominal = biases(loop, linear, n)
-    if not np.isfinite(bias).all():
+    bias = biases(loop, linear, n)
+    if not np.isfinite(bias.rows).all():
         return None
-    return _tube(loop, linear, n, bias, nominal, np.zeros((1, n + 2, _ERRORS)))
+    return _tube(loop, linear, n, bias, np.zeros((1, n + 2, _ERRORS)))
 
 
 def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tube | None]:
@@ -167,7 +168,7 @@ def with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube) -> Tube | None
     """A tube that covers, too, what is of second order in it; None where none was found that stays in the corridor."""
     if tube.n > LONG:
         return None
-    bias, parts = biases(loop, linear, tube.n)[0], 1 if linear.is_constant else min(_PARTS, loop.steps)
+    bias, parts = biases(loop, linear, tube.n), 1 if linear.is_constant else min(_PARTS, loop.steps)
     remainder = np.zeros((parts, tube.n + 2, _ERRORS))
     found: Tube | None = replace(tube, remainder=remainder)
     for _ in range(_ROUNDS):
@@ -177,41 +178,58 @@ def with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube) -> Tube | None
         if (needed <= remainder + _ROUNDING).all():
             return found
         remainder = np.maximum(remainder, _MORE * needed)
-        found = _tube(loop, linear, tube.n, bias, tube.nominal, remainder)
+        found = _tube(loop, linear, tube.n, bias, remainder)
     return None
 
 
-def biases(loop: LapLoop, linear: LinearLoop, n: int) -> tuple[Floats, Floats]:
-    """b_i, shape (R, n + 2, 3), row i that of i slots after a reception, and the loss-free errors, shape (R, 3)."""
-    every = loop.steps if linear.is_constant else max(1, math.ceil(loop.steps * (n + 2) / _LARGEST_BIAS))
-    _, free = loop.excursions(np.zeros(n + 2, dtype=np.bool_), every, kept=n + 2, follow=False)
-    _, lost = loop.excursions(outage(n), every, kept=n + 2, follow=False)
-    bias, nominal = lost - free, free[:, 0]
-    if every > 1 and not linear.is_constant:
-        bias, nominal = (_between(rows, every, loop.steps) for rows in (bias, nominal))
-    return np.ascontiguousarray(bias), np.ascontiguousarray(nominal)
+class Biases(NamedTuple):
+    """b_i, and the errors of the loss-free motion."""
+
+    rows: Floats
+    """b_i of outages that begin at every so many steps of the lap, shape (., n + 2, 3); entry i: i slots after a
+    reception."""
+    every: int
+    nominal: Floats
+    """Shape (R, 3)."""
+
+    def at(self, steps: NDArray[np.int64]) -> Floats:
+        """Of outages that begin at these steps, which are interpolated linearly, shape (S, n + 2, 3)."""
+        lap, found = len(self.nominal), np.empty((len(steps), *self.rows.shape[1:]))
+        for row, step in enumerate(steps.tolist()):
+            before, after, share = neighbours(step % lap, self.every, len(self.rows), lap)
+            found[row] = (1.0 - share) * self.rows[before] + share * self.rows[after]
+        return found
 
 
-def _between(rows: Floats, every: int, steps: int) -> Floats:
-    """Rows of every so many steps of a lap, linearly interpolated to all of them."""
-    k = np.arange(steps)
-    before = np.minimum(k // every, len(rows) - 1)
-    after = (before + 1) % len(rows)
-    width = np.where(before + 1 < len(rows), every, steps - (len(rows) - 1) * every)
-    share = ((k - before * every) / width).reshape(-1, *(1,) * (rows.ndim - 1))
-    return np.asarray((1.0 - share) * rows[before] + share * rows[after])
+def neighbours(step: int, every: int, rows: int, lap: int) -> tuple[int, int, float]:
+    """(row before a step, row after it, share of the second) where there is a row for every so many steps of a lap."""
+    before = min(step // every, rows - 1)
+    width = every if before + 1 < rows else lap - before * every
+    return before, (before + 1) % rows, (step - before * every) / width
 
 
-def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Floats, nominal: Floats, remainder: Floats) -> Tube | None:
+def biases(loop: LapLoop, linear: LinearLoop, n: int) -> Biases:
+    """Of outages of `n` slots."""
+    lap = 1 if linear.is_constant else loop.steps
+    every = max(1, math.ceil(lap * (n + 2) / _LARGEST_BIAS))
+    _, (free,) = loop.excursions(np.zeros(lap + n + 2, dtype=np.bool_), loop.steps, kept=lap + n + 2, follow=False)
+    _, lost = loop.excursions(outage(n), loop.steps if linear.is_constant else every, kept=n + 2, follow=False)
+    for row, path in enumerate(lost):
+        path -= free[row * every : row * every + n + 2]
+    return Biases(lost, every, np.ascontiguousarray(free[:lap]))
+
+
+def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Floats) -> Tube | None:
     """The tube with a given remainder; None where it grows out of the corridor, or for ever."""
-    rows, template = len(bias), template_of(linear, _SIDES_OF_LONG if n > LONG else _SIDES)
+    rows, template = len(bias.nominal), template_of(linear, _SIDES_OF_LONG if n > LONG else _SIDES)
     lap = -(-max(rows, n + 2, _WARM_UP) // rows) * rows  # in whole turns of the rows, longer than any memory
     widths = loop.widths
     limit = _FARTHER * min(widths.distance, max(widths.along, widths.across))
     window = np.zeros((n + 2, len(template.directions)))
     bounds = np.empty((lap, len(template.directions)))
-    drive = compiled(_push)
-    arguments = linear.F, linear.G, linear.H, linear.K, bias, remainder, template.directions, template.lever
+    drive = compiled(_push, of_size_3(linear.F, linear.G))
+    matrices = linear.F, linear.G, linear.H, linear.K
+    arguments = *matrices, bias.rows, bias.every, rows, remainder, template.directions, template.lever
     begun = np.empty((_WARM_UP, len(template.directions)))
     if not drive(*arguments, -_WARM_UP % rows, window, begun, limit):
         return None
@@ -222,34 +240,41 @@ def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Floats, nominal: Floa
             return None
         if (window <= before).all():
             of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)
-            return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
+            return Tube(
+                n, of_rows, template, bias.nominal, remainder, *_extent(of_rows, template, bias.nominal, widths)
+            )
     return None
 
 
 def _push(
-    F: Floats, G: Floats, H: Floats | None, K: Floats | None, bias: Floats, remainder: Floats, directions: Floats,
-    lever: float, first: int, window: Floats, bounds: Floats, limit: float,
+    F: Floats, G: Floats, H: Floats | None, K: Floats | None, bias: Floats, every: int, lap: int, remainder: Floats,
+    directions: Floats, lever: float, first: int, window: Floats, bounds: Floats, limit: float,
 ) -> bool:  # fmt: skip
     """Drive the bounds on: row j of `bounds` is that of step first + j; False where one leaves the limit.
 
-    `window`, row i: the bounds that are known of the state i steps on, all of them for i = 0; in place.
+    `window`, row i: the bounds that are known of the state i steps on, all of them for i = 0; in place. Directions that
+    are opposite are looked at together.
     """
     count, longest, sides = directions.shape[0], window.shape[0] - 1, directions.shape[0] - 2
-    size = F.shape[1]
+    size, half = F.shape[1], (directions.shape[0] - 2) // 2
     M, M_next = np.empty((size, size)), np.empty((size, size))
     N, N_next = np.empty((size, size)), np.empty((size, size))
     sine = math.sin(2.0 * math.pi / sides)
-    sectors = np.zeros(count, dtype=np.int64)
+    c_y, c_t = directions[2:, 1].copy(), directions[2:, 2] / lever
+    sectors = np.zeros(half + 1, dtype=np.int64)
     for j in range(bounds.shape[0]):
         for i in range(count):
             bounds[j, i] = window[0, i]
-        if not (max(window[0, 0], window[0, 1]) <= limit and max(window[0, 2], window[0, 2 + sides // 2]) <= limit):
+        if not (max(window[0, 0], window[0, 1]) <= limit and max(window[0, 2], window[0, 2 + half]) <= limit):
             return False
         for i in range(size):
             for p in range(size):
                 M[i, p] = N[i, p] = 1.0 if i == p else 0.0
-        for i in range(count):
-            sectors[i] = i - 2 if i >= 2 else 0
+        for i in range(half + 1):
+            sectors[i] = max(0, i - 1)
+        begun = (first + j) % lap
+        before, after, share = neighbours(begun, every, bias.shape[0], lap)
+        part = begun * remainder.shape[0] // lap
         for length in range(1, longest + 1):
             row = (first + j + length - 1) % F.shape[0]
             multiply(F[row], M, False, M_next, False)
@@ -260,34 +285,38 @@ def _push(
                     multiply(K[row], M, False, N_next, True)
                 assign(N_next, N)
             assign(M_next, M)
-            begun = (first + j) % bias.shape[0]
-            part = begun * remainder.shape[0] // bias.shape[0]
-            for i in range(count):
-                x, y, theta = directions[i, 0], directions[i, 1], directions[i, 2]
+            b_x = (1.0 - share) * bias[before, length, 0] + share * bias[after, length, 0]
+            b_y = (1.0 - share) * bias[before, length, 1] + share * bias[after, length, 1]
+            b_t = (1.0 - share) * bias[before, length, 2] + share * bias[after, length, 2]
+            for i in range(half + 1):
+                one, other = (0, 1) if i == 0 else (i + 1, i + 1 + half)
+                x, y, theta = directions[one, 0], directions[one, 1], directions[one, 2]
                 p_x = M[0, 0] * x + M[1, 0] * y + M[2, 0] * theta
                 p_y = M[0, 1] * x + M[1, 1] * y + M[2, 1] * theta
                 p_t = (M[0, 2] * x + M[1, 2] * y + M[2, 2] * theta) / lever
-                value = p_x * bounds[j, 0] if p_x >= 0.0 else -p_x * bounds[j, 1]
+                ahead, behind = (bounds[j, 0], bounds[j, 1]) if p_x >= 0.0 else (bounds[j, 1], bounds[j, 0])
+                value, opposite = abs(p_x) * ahead, abs(p_x) * behind
                 side = sectors[i]
                 # The sector that holds (p_y, p_t), searched for from where it was after one slot less.
                 for _ in range(sides):
-                    ahead = side + 1 if side + 1 < sides else 0
-                    c_y, c_t = directions[2 + side, 1], directions[2 + side, 2] / lever
-                    a_y, a_t = directions[2 + ahead, 1], directions[2 + ahead, 2] / lever
-                    left, right = c_y * p_t - c_t * p_y, p_y * a_t - p_t * a_y
+                    further = side + 1 if side + 1 < sides else 0
+                    left, right = c_y[side] * p_t - c_t[side] * p_y, p_y * c_t[further] - p_t * c_y[further]
                     if left >= 0.0 and right >= 0.0:
-                        value += (right * bounds[j, 2 + side] + left * bounds[j, 2 + ahead]) / sine
+                        near, far = bounds[j, 2 + side], bounds[j, 2 + further]
+                        value += (right * near + left * far) / sine
+                        near, far = bounds[j, 2 + (side + half) % sides], bounds[j, 2 + (further + half) % sides]
+                        opposite += (right * near + left * far) / sine
                         sectors[i] = side
                         break
-                    if left < 0.0 and c_y * p_y + c_t * p_t > 0.0:
+                    if left < 0.0 and c_y[side] * p_y + c_t[side] * p_t > 0.0:
                         side = side - 1 if side > 0 else sides - 1
                     else:
-                        side = ahead
-                value += bias[begun, length, 0] * x + bias[begun, length, 1] * y + bias[begun, length, 2] * theta
-                value += remainder[part, length, 0] * abs(x) + remainder[part, length, 1] * abs(y)
-                value += remainder[part, length, 2] * abs(theta)
-                if value > window[length, i]:
-                    window[length, i] = value
+                        side = further
+                pushed = b_x * x + b_y * y + b_t * theta
+                unknown = remainder[part, length, 0] * abs(x) + remainder[part, length, 1] * abs(y)
+                unknown += remainder[part, length, 2] * abs(theta)
+                window[length, one] = max(window[length, one], value + pushed + unknown)
+                window[length, other] = max(window[length, other], opposite - pushed + unknown)
         for length in range(longest):
             for i in range(count):
                 window[length, i] = window[length + 1, i]
@@ -307,7 +336,7 @@ def _extent(bounds: Floats, template: Template, nominal: Floats, widths: Widths)
     return np.maximum(distance / widths.distance, np.maximum(along / widths.along, across / widths.across)), distance
 
 
-def measured_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Floats) -> Floats:
+def measured_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Biases) -> Floats:
     """Largest difference of the nonlinear loop from M_i z + b_i, from the corners of a tube, by part of the lap.
 
     Shape (parts, n + 2, 3). Of each part it is measured from where it begins, and holds for it and the one before.
@@ -321,13 +350,13 @@ def measured_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Floa
     ahead, left, turned = (np.stack((widest[:, one], -widest[:, other])) / unit for one, other, unit in pairs)
     identity = np.broadcast_to(np.eye(_ERRORS), (len(steps), _ERRORS, _ERRORS))
     maps = np.stack((identity, *burst_maps(linear, length - 1, steps % len(linear.F))))
-    rows, found = steps % len(bias), np.zeros((len(steps), length, _ERRORS))
+    pushed, found = bias.at(steps), np.zeros((len(steps), length, _ERRORS))
     nominal = tube.nominal[(steps[:, None] + np.arange(length)) % len(tube.nominal)]
     for x, y, theta in itertools.product(ahead, left, turned):
         offsets = np.column_stack(_placed(x, y, theta))
         _, paths = loop.excursions(outage(tube.n), every, offsets=offsets, kept=length, follow=False)
         deviation = paths - nominal
-        apart = deviation - np.einsum("isjk,sk->sij", maps, deviation[:, 0]) - bias[rows]
+        apart = deviation - np.einsum("isjk,sk->sij", maps, deviation[:, 0]) - pushed
         found = np.fmax(found, np.abs(apart))
     found = np.maximum(found, np.roll(found, -1, axis=0))
     return found[np.arange(parts) * len(steps) // parts]

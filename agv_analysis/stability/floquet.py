@@ -47,8 +47,15 @@ _LAPS_OF_DELAY = 5
 _STEPS = 1000
 """Of a loop that is the same at every step so many are driven at least."""
 
+_SETTLED, _ROUGHLY = 1e-10, 1e-2
+"""Change of a growth from one lap to the next, relative where it is above 1, at which it has settled; and where its
+sign alone is asked for."""
 
-def constant_delay(loop: LinearLoop, n: int) -> float:
+_DOUBTFUL = 1.0
+"""Growth over a lap below which a roughly settled one does not tell the sign."""
+
+
+def constant_delay(loop: LinearLoop, n: int, settled: float = _SETTLED) -> float:
     """Largest growth (logarithm) over a lap of the error, if the pose is always `n` steps old.
 
     By iterating a subspace of the lifted system over laps until its largest Ritz value settles.
@@ -71,7 +78,7 @@ def constant_delay(loop: LinearLoop, n: int) -> float:
         state = np.concatenate((z, past.reshape(-1, columns)))
         ritz = np.abs(np.linalg.eigvals(basis.T @ state)).max()
         before, growth = growth, log_scale + math.log(ritz) if ritz > 0.0 else -math.inf
-        if growth == before or abs(growth - before) <= 1e-10 * max(1.0, abs(growth)):
+        if growth == before or abs(growth - before) <= settled * max(1.0, abs(growth)):
             break
     return growth * (loop.steps / steps)
 
@@ -188,7 +195,9 @@ def _drive_predicted(
 
 def is_stable_with_delay(loop: LinearLoop, n: int) -> bool:
     """Does a lap contract every small error if the pose is always `n` steps old?"""
-    return constant_delay(loop, n) < MARGINAL * loop.steps
+    rough = constant_delay(loop, n, _ROUGHLY)
+    growth = rough if abs(rough) > _DOUBTFUL else constant_delay(loop, n)
+    return growth < MARGINAL * loop.steps
 
 
 def largest_constant_delay(loop: LinearLoop, limit: int = 10_000) -> int | None:

@@ -21,16 +21,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
+from agv_analysis.simulation.batch import cores
 from agv_analysis.stability.kanayama_delay import KanayamaGains
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
-from agv_analysis.stability.products import log_spectral_radius
-from agv_analysis.stability.reception_maps import burst_maps
+from agv_analysis.stability.products import log_spectral_radius, multiply
+from agv_analysis.stability.reception_maps import burst_maps, burst_maps_in
 
 STABLE = "stable"
 UNSTABLE = "unstable"
@@ -254,41 +257,90 @@ def _worst_growth(loop: LinearLoop, longest: int, P: Floats) -> float:
     With V(k) the largest growth from step k to the end of the lap, V(k) = max_L [log norm of M_L(k) + V(k + L)]. For
     any values W assumed beyond the end, max_k V(k) - W(k) bounds the growth of a lap (Collatz-Wielandt, max-plus).
     """
-    log_norms = np.stack([_log_norms(M, P) for M in burst_maps(loop, longest)], axis=1)
+    log_norms = _log_norms_of_bursts(loop, longest, P)
     if loop.is_constant:
         return float((log_norms[0] / np.arange(1, longest + 1)).max())
     log_norms = np.tile(log_norms, (-(-longest // loop.steps), 1))
     steps = len(log_norms)
-    beyond = np.zeros(longest)
+    V = np.zeros(steps + longest)
     for _ in range(2):
-        V = np.concatenate((np.empty(steps), beyond))
-        for k in range(steps - 1, -1, -1):
-            V[k] = (log_norms[k] + V[k + 1 : k + 1 + longest]).max()
+        beyond = V[steps:].copy()
+        compiled(_heaviest_paths)(log_norms, V)
         growth = float((V[:longest] - beyond).max())
-        beyond = V[:longest] - V[0]
+        V[steps:] = V[:longest] - V[0]
     return growth / steps
+
+
+def _heaviest_paths(weights: Floats, V: Floats) -> None:
+    """V[k] = max_L weights[k, L - 1] + V[k + L], from the last row of the weights, shape (K, longest), to the first."""
+    for k in range(weights.shape[0] - 1, -1, -1):
+        largest = -math.inf
+        for i in range(weights.shape[1]):
+            largest = max(largest, weights[k, i] + V[k + 1 + i])
+        V[k] = largest
+
+
+def _log_norms_of_bursts(loop: LinearLoop, longest: int, P: Floats) -> Floats:
+    """`_log_norms` of `burst_maps`, shape (R, longest); the steps of the lap are shared out among threads."""
+    root = np.linalg.cholesky(P).T
+    log_norms = np.empty((len(loop.F), longest))
+
+    def fill_in(begins: NDArray[np.int64]) -> None:
+        for i, inner in enumerate(burst_maps_in(loop, root, longest, begins)):
+            log_norms[begins, i] = _log_euclidean_norms(inner)
+
+    parts = np.array_split(np.arange(len(loop.F)), min(cores(), len(loop.F)))
+    with ThreadPoolExecutor(len(parts)) as pool:
+        list(pool.map(fill_in, parts))
+    return log_norms
 
 
 def _log_norms(maps: Floats, P: Floats) -> Floats:
     """Logarithm of the norm of each map, shape (N, m, m), in the vector norm sqrt(x' P x); shape (N,)."""
     root = np.linalg.cholesky(P).T
-    inner = root @ maps @ np.linalg.inv(root)
-    squares = np.maximum(_largest_eigenvalues(np.swapaxes(inner, 1, 2) @ inner), 0.0)
+    return _log_euclidean_norms(root @ maps @ np.linalg.inv(root))
+
+
+def _log_euclidean_norms(maps: Floats) -> Floats:
+    """Logarithm of the largest singular value of each map, shape (N, m, m); shape (N,)."""
+    squares = np.empty(len(maps))
+    if maps.shape[-1] == 3:
+        compiled(_fill_in_squares)(maps, squares)
+    else:
+        squares = np.linalg.eigvalsh(np.swapaxes(maps, 1, 2) @ maps)[:, -1]
     with np.errstate(divide="ignore"):  # a burst that leaves nothing of the error: -inf
-        return np.asarray(0.5 * np.log(squares))
+        return np.asarray(0.5 * np.log(np.maximum(squares, 0.0)))
+
+
+def _fill_in_squares(maps: Floats, squares: Floats) -> None:
+    """Square of the largest singular value of each of the maps, shape (N, 3, 3)."""
+    S = np.empty((3, 3))
+    for k in range(len(maps)):
+        multiply(maps[k], maps[k], True, S, False)
+        squares[k] = _largest_eigenvalue(S)
 
 
 def _largest_eigenvalues(S: Floats) -> Floats:
-    """Largest eigenvalue of symmetric matrices of shape (N, m, m): for m = 3 by Smith's closed form (CACM 4, 1961)."""
+    """Largest eigenvalue of symmetric matrices of shape (N, m, m)."""
     if S.shape[-1] != 3:
         return np.asarray(np.linalg.eigvalsh(S)[:, -1])
-    mean = np.trace(S, axis1=1, axis2=2) / 3.0
-    B = S - mean[:, None, None] * np.eye(3)
-    spread = np.sqrt((B * B).sum(axis=(1, 2)) / 6.0)
-    det = (
-        B[:, 0, 0] * (B[:, 1, 1] * B[:, 2, 2] - B[:, 1, 2] ** 2)
-        - B[:, 0, 1] * (B[:, 0, 1] * B[:, 2, 2] - B[:, 1, 2] * B[:, 0, 2])
-        + B[:, 0, 2] * (B[:, 0, 1] * B[:, 1, 2] - B[:, 1, 1] * B[:, 0, 2])
-    )
-    cos3 = np.clip(det / np.maximum(2.0 * spread**3, 1e-300), -1.0, 1.0)
-    return np.asarray(mean + 2.0 * spread * np.cos(np.arccos(cos3) / 3.0))
+    found = np.empty(len(S))
+    compiled(_fill_in_eigenvalues)(np.ascontiguousarray(S), found)
+    return found
+
+
+def _fill_in_eigenvalues(S: Floats, largest: Floats) -> None:
+    """The largest eigenvalue of each of symmetric matrices S, shape (N, 3, 3)."""
+    for k in range(len(S)):
+        largest[k] = _largest_eigenvalue(S[k])
+
+
+def _largest_eigenvalue(S: Floats) -> float:
+    """The largest eigenvalue of a symmetric matrix of shape (3, 3), by Smith's closed form (CACM 4, 1961)."""
+    p, q, r = S[0, 1], S[0, 2], S[1, 2]
+    mean = (S[0, 0] + S[1, 1] + S[2, 2]) / 3.0
+    a, b, c = S[0, 0] - mean, S[1, 1] - mean, S[2, 2] - mean
+    spread = math.sqrt((a * a + b * b + c * c + 2.0 * (p * p + q * q + r * r)) / 6.0)
+    det = a * (b * c - r * r) - p * (p * c - r * q) + q * (p * r - b * q)
+    cos3 = min(1.0, max(-1.0, det / max(2.0 * spread * spread * spread, 1e-300)))
+    return mean + 2.0 * spread * math.cos(math.acos(cos3) / 3.0)

@@ -31,7 +31,16 @@ from agv_analysis.stability.first_border import borders
 from agv_analysis.stability.floquet import drop_sequence
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.moment_growth import SETTLED, moment_growth
-from agv_analysis.stability.products import assign, divide, log_spectral_radius, multiply
+from agv_analysis.stability.products import (
+    assign,
+    column_count,
+    divide,
+    largest_entry,
+    log_spectral_radius,
+    multiply,
+    of_size_3,
+    row_count,
+)
 
 _LARGEST = 400
 """Size of the recursion's matrix up to which its eigenvalues are asked for instead of driving laps."""
@@ -53,6 +62,9 @@ _ROUGHLY = 1e-3
 
 _DOUBTFUL = 0.1
 """Growth over a lap below which a roughly settled one does not tell the sign."""
+
+_PLACES, _DOUBTFUL_AT_PLACES = 2000, 10.0
+"""Places of a lap, at least, at which a growth is asked for first, and up to which size it does not tell the sign."""
 
 
 def step_maps(loop: LinearLoop, k: int = 0) -> tuple[Floats, Floats]:
@@ -155,9 +167,8 @@ def _growth_of_repeated(loop: LinearLoop, lost: NDArray[np.bool_]) -> float:
 
 def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:
     """Sends the moments through so many steps, in place; they are to be multiplied by exp(what it returns)."""
-    return lambda steps: float(
-        compiled(_drive_lap)(loop.F, loop.G, loop.H, loop.K, chain.transition, chain.delivery, steps, *moments)
-    )
+    drive = compiled(_drive_lap, of_size_3(loop.F, loop.G))
+    return lambda steps: float(drive(loop.F, loop.G, loop.H, loop.K, chain.transition, chain.delivery, steps, *moments))
 
 
 def growth_over_lap(
@@ -240,14 +251,7 @@ def _drive_lap(
             _mix(T[:, j], g, received_zz, missed_zz, zz[j])
             _mix(T[:, j], g, received_zh, missed_zh, zh[j])
             _mix(T[:, j], g, received_hh, missed_hh, hh[j])
-            for p in range(m):
-                for r in range(m):
-                    largest = max(largest, abs(zz[j, p, r]))
-                for r in range(q):
-                    largest = max(largest, abs(zh[j, p, r]))
-            for p in range(q):
-                for r in range(q):
-                    largest = max(largest, abs(hh[j, p, r]))
+            largest = max(largest, largest_entry(zz[j]), largest_entry(zh[j]), largest_entry(hh[j]))
         if largest > 1e100 or 0.0 < largest < 1e-100:
             for j in range(states):
                 divide(zz[j], largest)
@@ -259,8 +263,8 @@ def _drive_lap(
 
 def _mix(weights: Floats, g: Floats, received: Floats, missed: Floats, mixed: Floats) -> None:
     """What comes into one state: from each state i with weight T_ij, received with probability g_i or lost."""
-    for p in range(mixed.shape[0]):
-        for r in range(mixed.shape[1]):
+    for p in range(row_count(mixed)):
+        for r in range(column_count(mixed)):
             value = 0.0
             for i in range(len(g)):
                 value += weights[i] * (g[i] * received[i, p, r] + (1.0 - g[i]) * missed[i, p, r])
@@ -272,10 +276,10 @@ def _symmetric_product(A: Floats, B: Floats, product: Floats, add: bool) -> None
 
     Rounding must not make a skew part, which would not obey the recursion of the moments and outlive them.
     """
-    for i in range(product.shape[0]):
+    for i in range(row_count(product)):
         for j in range(i + 1):
             value = product[i, j] if add else 0.0
-            for m in range(A.shape[1]):
+            for m in range(column_count(A)):
                 value += A[i, m] * B[j, m]
             product[i, j] = value
             product[j, i] = value
@@ -286,21 +290,35 @@ def loss_borders(loop: LinearLoop) -> tuple[float, ...]:
 
     (0.0,) if it is unstable without any. Behind a predictor, which may make any losses harmless, up to MOST_LOST.
     """
-    moments = Moments.unit(loop, 1)
 
-    def growth(p: float, settled: float) -> float:
-        found = lap_growth(loop, bernoulli(p), moments, settled) - MARGINAL * loop.steps
-        return max(found, -MARGINAL) if p == 1.0 else found  # nothing received: what is off stays off
+    def growth_of(part: LinearLoop) -> Callable[[float, float], float]:
+        moments = Moments.unit(part, 1)
+
+        def growth(p: float, settled: float) -> float:
+            found = lap_growth(part, bernoulli(p), moments, settled) - MARGINAL * part.steps
+            return max(found, -MARGINAL) if p == 1.0 else found  # nothing received: what is off stays off
+
+        return growth
 
     grid = np.append(1.0 - np.logspace(0.0, math.log10(1.0 - MOST_LOST), _TRIED), [] if loop.predicts else [1.0])
-    return borders(_sign_first(growth), grid.tolist())
+    return borders(_sign_first(loop, growth_of), grid.tolist())
 
 
-def _sign_first(growth: Callable[[float, float], float]) -> Callable[[float], float]:
-    """A growth over a lap that is settled only where its sign is in doubt; values are kept."""
+def _sign_first(
+    loop: LinearLoop, growth_of: Callable[[LinearLoop], Callable[[float, float], float]]
+) -> Callable[[float], float]:
+    """A growth over a lap that is exact only where its sign is in doubt; values are kept.
+
+    Elsewhere it is that of some places of the lap, or roughly settled.
+    """
+    thinned = loop.thinned(_PLACES)
+    growth, at_places = growth_of(loop), growth_of(thinned)
+    ratio = loop.steps / thinned.steps
 
     @functools.cache
     def found(x: float) -> float:
+        if ratio > 1.0 and abs(guess := ratio * at_places(x, _ROUGHLY)) > _DOUBTFUL_AT_PLACES:
+            return guess
         rough = growth(x, _ROUGHLY)
         return rough if abs(rough) > _DOUBTFUL else growth(x, SETTLED)
 
@@ -321,12 +339,15 @@ def burst_borders(loop: LinearLoop, loss_rate: float) -> tuple[float, ...]:
 
     Beginning with the shortest possible if it is unstable with that. Up to 1e6, or eight times the first of them.
     """
-    moments, shortest = Moments.unit(loop, 2), shortest_mean_burst(loss_rate)
+    shortest = shortest_mean_burst(loss_rate)
 
-    def growth(burst: float, settled: float) -> float:
-        return lap_growth(loop, bursty(loss_rate, burst), moments, settled) - MARGINAL * loop.steps
+    def growth_of(part: LinearLoop) -> Callable[[float, float], float]:
+        moments = Moments.unit(part, 2)
+        return lambda burst, settled: (
+            lap_growth(part, bursty(loss_rate, burst), moments, settled) - MARGINAL * part.steps
+        )
 
-    signed, grid, end = _sign_first(growth), [shortest], LONGEST_BURST
+    signed, grid, end = _sign_first(loop, growth_of), [shortest], LONGEST_BURST
     while grid[-1] < end:
         if end == LONGEST_BURST and signed(grid[-1]) >= 0.0:
             end = min(end, 8.0 * grid[-1])

@@ -9,6 +9,7 @@ import numpy as np
 
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
+from agv_ros.substitution import Replacements
 
 
 def ordered_product(factors: Floats) -> tuple[Floats, float]:
@@ -90,28 +91,52 @@ def _orthogonalised_pass(factors: Floats, basis: Floats, logs: Floats) -> None:
                 basis[i, j] = image[i, j] / length if length > 0.0 else 0.0
 
 
+def row_count(A: Floats) -> int:
+    """Number of rows of a matrix, asked by the functions below; see `of_size_3`."""
+    return A.shape[0]
+
+
+def column_count(A: Floats) -> int:
+    """Number of its columns."""
+    return A.shape[1]
+
+
+def three(_: Floats) -> int:
+    """3, whatever the matrix."""
+    return 3
+
+
+def of_size_3(*stacks: Floats | None) -> Replacements | None:
+    """Replacements for a function that is compiled, where all matrices, shape (..., p, r), are 3 x 3; else None.
+
+    A compiler that knows the sizes writes the loops below out, which makes them several times as fast.
+    """
+    is_3 = all(stack is None or stack.shape[-2:] == (3, 3) for stack in stacks)
+    return {row_count: three, column_count: three} if is_3 else None
+
+
 def assign(source: Floats, target: Floats) -> None:
     """`target` = `source`, shape (p, r); of a larger `source` its first rows and columns.
 
     Written out, as what follows: numba takes seconds to compile `target[:] = source` or `matrix /= divisor`.
     """
-    for i in range(target.shape[0]):
-        for j in range(target.shape[1]):
+    for i in range(row_count(target)):
+        for j in range(column_count(target)):
             target[i, j] = source[i, j]
 
 
 def divide(matrix: Floats, divisor: float) -> None:
     """`matrix` /= `divisor`, shape (p, r)."""
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
+    for i in range(row_count(matrix)):
+        for j in range(column_count(matrix)):
             matrix[i, j] /= divisor
 
 
 def largest_entry(matrix: Floats) -> float:
     """Largest modulus of the entries of a matrix, NaN if one is NaN."""
     largest = 0.0
-    for i in range(matrix.shape[0]):
-        for j in range(matrix.shape[1]):
+    for i in range(row_count(matrix)):
+        for j in range(column_count(matrix)):
             size = abs(matrix[i, j])
             if size > largest or math.isnan(size):
                 largest = size
@@ -123,9 +148,9 @@ def multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool)
 
     Written to be compiled into its callers, where numpy's own costs more than the product.
     """
-    for i in range(product.shape[0]):
-        for j in range(product.shape[1]):
+    for i in range(row_count(product)):
+        for j in range(column_count(product)):
             value = product[i, j] if add else 0.0
-            for m in range(A.shape[1]):
+            for m in range(column_count(A)):
                 value += A[i, m] * (B[j, m] if transposed else B[m, j])
             product[i, j] = value

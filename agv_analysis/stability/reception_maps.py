@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agv_analysis.compiled import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.products import assign, multiply
+from agv_analysis.stability.products import assign, multiply, of_size_3
 
 
 def burst_maps(loop: LinearLoop, longest: int, begins: NDArray[np.int64] | None = None) -> Iterator[Floats]:
@@ -25,21 +25,44 @@ def burst_maps(loop: LinearLoop, longest: int, begins: NDArray[np.int64] | None 
 
     Or only of the bursts that begin at the steps `begins`, shape (B,): then of shape (B, m, m).
     """
-    F, G, H, K = loop.F, loop.G, loop.H, loop.K
-    rows, m, q = G.shape
-    first = np.arange(rows) if begins is None else begins
-    M = np.broadcast_to(np.eye(m), (len(first), m, m))
-    N = np.broadcast_to(np.eye(q, m), (len(first), q, m))
+    first = np.arange(len(loop.F)) if begins is None else begins
+    return _bursts(loop.F, loop.G, loop.H, loop.K, np.eye(loop.size), first, longest)
+
+
+def burst_maps_in(loop: LinearLoop, basis: Floats, longest: int, begins: NDArray[np.int64]) -> Iterator[Floats]:
+    """As `burst_maps`, of S z in place of z: S M_L inv(S), with an invertible `basis` S, shape (m, m)."""
+    inverse, K = np.linalg.inv(basis), loop.K
+    F, G = np.ascontiguousarray(basis @ loop.F @ inverse), np.ascontiguousarray(basis @ loop.G)
+    return _bursts(F, G, loop.H, None if K is None else np.ascontiguousarray(K @ inverse), inverse, begins, longest)
+
+
+def _bursts(
+    F: Floats, G: Floats, H: Floats | None, K: Floats | None, inverse: Floats, begins: NDArray[np.int64], longest: int
+) -> Iterator[Floats]:  # fmt: skip
+    """What `burst_maps` and `burst_maps_in` say; N_0 = C `inverse`."""
+    m, q = G.shape[1:]
+    M = np.array(np.broadcast_to(np.eye(m), (len(begins), m, m)), order="C")
+    N = np.array(np.broadcast_to(inverse[:q], (len(begins), q, m)), order="C")
     for i in range(longest):
-        now = (first + i) % rows
-        following = F[now] @ M
-        if H is None:
-            following[:, :, :q] += G[now]
-        else:
-            following += G[now] @ N
-            N = H[now] @ N if K is None else H[now] @ N + K[now] @ M
-        M = following
-        yield M
+        compiled(_one_slot_on, of_size_3(F, G))(F, G, H, K, begins + i, M, N)
+        yield M.copy()
+
+
+def _one_slot_on(
+    F: Floats, G: Floats, H: Floats | None, K: Floats | None, steps: NDArray[np.int64], M: Floats, N: Floats
+) -> None:
+    """M_i and N_i of bursts that have come to these steps, made M_(i+1) and N_(i+1), in place; None as elsewhere."""
+    M_next, N_next = np.empty(M.shape[1:]), np.empty(N.shape[1:])
+    for r in range(len(steps)):
+        k = steps[r] % F.shape[0]
+        multiply(F[k], M[r], False, M_next, False)
+        multiply(G[k], N[r], False, M_next, True)
+        if H is not None:
+            multiply(H[k], N[r], False, N_next, False)
+            if K is not None:
+                multiply(K[k], M[r], False, N_next, True)
+            assign(N_next, N[r])
+        assign(M_next, M[r])
 
 
 def reception_maps(loop: LinearLoop, received: NDArray[np.int64], end: int) -> Floats:
@@ -56,7 +79,8 @@ def interval_maps(loop: LinearLoop, begins: NDArray[np.int64], lengths: NDArray[
     `lengths` in steps, >= 1, both of shape (n,); returns shape (n, m, m).
     """
     maps = np.empty((len(begins), loop.size, loop.size))
-    compiled(_fill_in_maps)(loop.F, loop.G, loop.H, loop.K, begins, lengths, maps)
+    drive = compiled(_fill_in_maps, of_size_3(loop.F, loop.G))
+    drive(loop.F, loop.G, loop.H, loop.K, begins, lengths, maps)
     return maps
 
 
