@@ -83,8 +83,9 @@ def _kernel(scenarios: list[Scenario], reference: NDArray[np.float64], lost: NDA
     laps, never = compiled(statistics_of_two), np.zeros_like(lost)
     start = at_rest(*scenarios[0].plant.initial_pose)
     cases = [RunInputs(lost, never, start, settings_of(scenario)) for scenario in scenarios]
+    squares = np.zeros((2, len(lost)))
     for one, other in zip(cases[::2], cases[1::2], strict=True):
-        laps(reference, one, other)
+        laps(reference, one, other, *squares)
 
 
 def _plain(reference: list[list[float]], lost: list[bool], kx: float) -> tuple[float, ...]:

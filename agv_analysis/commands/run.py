@@ -143,7 +143,7 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     for one in vehicles:
         table.add_row(
             one.vehicle, str(one.steps), _text(one.loss_rate, ".2%"), _text(one.longest_outage, "d"),
-            _text(one.settle_1cm_steps, "d"), _text(one.deviation_max, ".3g"),
+            _text(one.settle_1cm_steps, "d"), _text(None if one.deviation is None else one.deviation["max"], ".3g"),
             _text(one.corridor_share, ".0%"), _text(one.contraction, ".2g"),
             one.verdict or "-",
         )  # fmt: skip

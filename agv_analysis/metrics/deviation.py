@@ -10,6 +10,7 @@ import numpy as np
 from agv_analysis.json_values import finite
 from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.metrics.initial_error import TWIN, InitialError
+from agv_analysis.metrics.order_statistics import P99, not_exceeded
 from agv_analysis.metrics.outages import Outage, longest_outage_between, outage_rows
 from agv_analysis.run import Floats, Run
 from agv_analysis.simulation.twin_on_reference import poses_without_losses
@@ -113,7 +114,7 @@ def deviation(run: Run, initial: InitialError) -> Deviation:
         since_seconds=float(run.time[begin] - run.time[0]),
         reason=reason,
         largest=float(seen.max()),
-        p99=float(np.percentile(seen, 99.0, method="inverted_cdf")),
+        p99=not_exceeded(seen, P99),
         rms=root_mean_square(seen),
         worst=tuple(_peaks(run, initial, distance, begin)) if seen.max() <= DIVERGED else (),
         speed=_largest(run.command[:, 0]),

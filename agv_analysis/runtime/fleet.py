@@ -7,7 +7,7 @@ has its own random numbers for downlink, delays, noise and slip, and its own tra
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -109,12 +109,10 @@ class Vehicle:
     settle_1cm_steps: int | None = None
     final_error: float | None = None
     """[m]"""
-    deviation_max: float | None = None
-    """Largest distance to its reference after its initial error has settled [m]."""
-    deviation_p99: float | None = None
-    deviation_rms: float | None = None
-    speed_max: float | None = None
-    """Largest |v| that its controller asked for [m/s]."""
+    deviation: Mapping[str, Any] | None = None
+    """How far it strayed, as the JSON of `analyse` has it: `max`, `p99`, `rms` [m], `worst`, and so on."""
+    speed: Mapping[str, Any] | None = None
+    """The same of what its controller asked for: `max` [m/s], `turn_rate_max` [rad/s]."""
     corridor_share: float | None = None
     """Largest share of its corridor that it used, above 1 outside; None without a corridor, as are the next two."""
     outages_outside: int | None = None
@@ -145,10 +143,8 @@ def judge(name: str, steps: int, failure: str, bag: Path) -> Vehicle:
         longest_outage=found.outages.uplink.longest,
         settle_1cm_steps=figures["settle_1cm_steps"],
         final_error=figures["final_error"],
-        deviation_max=figures["deviation"]["max"],
-        deviation_p99=figures["deviation"]["p99"],
-        deviation_rms=figures["deviation"]["rms"],
-        speed_max=figures["speed"]["max"],
+        deviation=figures["deviation"],
+        speed=figures["speed"],
         **_corridor(found),
         verdict=figures["verdict"],
         verdict_criterion=figures["verdict_criterion"],

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import numbers
+from agv_analysis.metrics.order_statistics import P99, not_exceeded
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
@@ -41,10 +42,12 @@ from agv_ros.substitution import Replacements
 _FIRST, *_OTHERS = get_type_hints(RunMetrics).items()
 STATISTICS = np.dtype([
     *((name, np.dtype(kind)) for name, kind in (_FIRST, *get_type_hints(Decay).items(), *_OTHERS)),
+    ("deviation_p99", np.dtype(float)),
     ("contraction", np.dtype(float)),
 ])  # fmt: skip
-"""One run's row: the fields of `loop.RunMetrics` and `decay.Decay`, and how far twins are apart in the end.
+"""One run's row: the fields of `loop.RunMetrics` and `decay.Decay`, and two more.
 
+`deviation_p99`: 99 % of the steps since the initial error has settled are no farther from the reference [m].
 `contraction` is that of `loop.statistics_of_twins`, NaN for a run without a twin.
 """
 
@@ -52,8 +55,8 @@ Table = NDArray[np.void]
 Realisations = Callable[[int, int, float], ChannelRealisation]
 Job = tuple[int, int]
 """One run: (row, column) of the table, that is, scenario and seed."""
-Result = tuple[Job, RunMetrics, Decay, float]
-"""What is known of a run: its metrics, what becomes of its initial error, how far twins are apart in the end."""
+Result = tuple[Job, RunMetrics, Decay, float, float]
+"""What is known of a run: its metrics, what becomes of its initial error, p99, how far twins are apart in the end."""
 
 TWIN_OFFSET = 1e-6
 """A twin begins this far from the run [m, m, rad]: far above rounding, far below what makes the loop nonlinear."""
@@ -133,10 +136,10 @@ class _Batch:
             parts = replacements_of(self._scenarios[row])
             of_kind = list(jobs)
             try:
-                for job, (steps, *metrics), of_start, contraction in run(
+                for job, (steps, *metrics), of_start, *others in run(
                     self._reference(row), of_kind, realisations, parts
                 ):
-                    self.table[job] = (steps, *of_start, *metrics, contraction)
+                    self.table[job] = (steps, *of_start, *metrics, *others)
             except PartError as error:
                 raise PartError(self._where_it_fails(of_kind) or str(error)) from error
         return len(unit)
@@ -158,17 +161,18 @@ class _Batch:
         direct = [job for job in jobs if self._is_direct(job)]
         for job in jobs:
             if not self._is_direct(job):
-                yield job, *self._over_links(reference, job, realisations, parts)[:2], math.nan
+                yield job, *self._over_links(reference, job, realisations, parts)[:3], math.nan
         for one, other in zip_longest(direct[::2], direct[1::2]):
             pair = [one] if other is None else [one, other]
             inputs, decays = zip(*(self._with_decay(reference, job, realisations, parts) for job in pair), strict=True)
+            squares = [np.zeros(self._steps[job[0]]) for job in pair]
             found = (
-                [run_parts(statistics, parts, reference, *inputs)]
+                [run_parts(statistics, parts, reference, *inputs, *squares)]
                 if other is None
-                else run_parts(statistics_of_two, parts, reference, *inputs)
+                else run_parts(statistics_of_two, parts, reference, *inputs, *squares)
             )
-            for job, metrics, of_start in zip(pair, found, decays, strict=True):
-                yield job, metrics, of_start, math.nan
+            for job, metrics, of_start, run, square in zip(pair, found, decays, inputs, squares, strict=True):
+                yield job, metrics, of_start, _p99(square[run.settled : metrics.steps]), math.nan
 
     def _with_twins(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
@@ -177,15 +181,16 @@ class _Batch:
             twin = start_of(self._scenarios[job[0]], TWIN_OFFSET)
             if self._is_direct(job):
                 inputs, of_start = self._with_decay(reference, job, realisations, parts)
-                found, contraction = run_parts(statistics_of_twins, parts, reference, inputs, twin)
-                yield job, found, of_start, contraction
+                squares = np.zeros(self._steps[job[0]])
+                found, contraction = run_parts(statistics_of_twins, parts, reference, inputs, twin, squares)
+                yield job, found, of_start, _p99(squares[inputs.settled : found.steps]), contraction
             else:
                 inputs = self._inputs(job, realisations)
-                found, of_start, traces = self._over_links(reference, job, realisations, parts)
+                found, of_start, p99, traces = self._over_links(reference, job, realisations, parts)
                 is_whole = found.steps == self._steps[job[0]]
                 arguments = reference, inputs, twin, *traces
                 apart = run_parts(contraction_over_links, parts, *arguments) if is_whole else math.inf
-                yield job, found, of_start, apart
+                yield job, found, of_start, p99, apart
 
     def _with_decay(
         self, reference: Floats, job: Job, realisations: Realisations, parts: Replacements
@@ -206,8 +211,8 @@ class _Batch:
 
     def _over_links(
         self, reference: Floats, job: Job, realisations: Realisations, parts: Replacements
-    ) -> tuple[RunMetrics, Decay, tuple[LinkTrace, LinkTrace]]:
-        """One run whose links have to be asked in the loop, its initial error, and what became of its messages."""
+    ) -> tuple[RunMetrics, Decay, float, tuple[LinkTrace, LinkTrace]]:
+        """One run whose links have to be asked in the loop, its initial error, p99, and what became of its messages."""
         realisation, inputs = self._realisation(job, realisations), self._inputs(job, realisations)
         relay, steps = self._scenarios[job[0]].relay, self._steps[job[0]]
         links = realisation.link_inputs(relay.uplink, "uplink"), realisation.link_inputs(relay.downlink, "downlink")
@@ -218,7 +223,7 @@ class _Batch:
         settled = squares[max(0, of_start.settle_1cm_steps) : found.steps]
         with np.errstate(over="ignore"):
             largest, rms = math.sqrt(settled.max(initial=0.0)), math.sqrt(np.mean(settled)) if len(settled) else 0.0
-        return found._replace(deviation_max=largest, deviation_rms=rms), of_start, (up, down)
+        return found._replace(deviation_max=largest, deviation_rms=rms), of_start, _p99(settled), (up, down)
 
     def _realisation(self, job: Job, realisations: Realisations) -> ChannelRealisation:
         row, column = job
@@ -239,3 +244,8 @@ class _Batch:
             numbers(realisation.normals(NOISE)) if scenario.plant.is_noisy else None,
             numbers(realisation.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,
         )
+
+
+def _p99(squares: Floats) -> float:
+    """`deviation_p99` of squared distances [m^2], shape (n,); inf where one is no number, 0 without any."""
+    return math.sqrt(not_exceeded(squares, P99)) if len(squares) else 0.0

@@ -411,18 +411,24 @@ def end(run: MetricsAccumulator, inputs: RunInputs) -> RunMetrics:
     )  # fmt: skip
 
 
-def statistics(reference: Rows, inputs: RunInputs) -> RunMetrics:
-    """One run of which only the metrics are kept; `reference` as of `history`."""
+def statistics(reference: Rows, inputs: RunInputs, squares: NDArray[np.float64]) -> RunMetrics:
+    """One run of which only the metrics are kept, and its squared distances [m^2], shape (N,).
+
+    `reference` as of `history`.
+    """
     run = begin(inputs)
     for k in range(len(inputs.lost)):
         now = reference_at(reference, k)
         run = proceed(run, k, now, compared_reference(now, reference, k, inputs.settings.ahead), inputs)
+        squares[k] = run.square
         if not run.goes_on:
             break
     return end(run, inputs)
 
 
-def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tuple[RunMetrics, RunMetrics]:
+def statistics_of_two(
+    reference: Rows, one: RunInputs, other: RunInputs, of_one: NDArray[np.float64], of_other: NDArray[np.float64]
+) -> tuple[RunMetrics, RunMetrics]:
     """Two runs on one reference, as `statistics`; together they take little longer than one.
 
     Each step of a run waits for a sine from the step before; meanwhile the core works on the other run.
@@ -432,12 +438,16 @@ def statistics_of_two(reference: Rows, one: RunInputs, other: RunInputs) -> tupl
         now = reference_at(reference, k)
         if first.goes_on:
             first = proceed(first, k, now, compared_reference(now, reference, k, one.settings.ahead), one)
+            of_one[k] = first.square
         if second.goes_on:
             second = proceed(second, k, now, compared_reference(now, reference, k, other.settings.ahead), other)
+            of_other[k] = second.square
     return end(first, one), end(second, other)
 
 
-def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple[RunMetrics, float]:
+def statistics_of_twins(
+    reference: Rows, inputs: RunInputs, twin: Loop, squares: NDArray[np.float64]
+) -> tuple[RunMetrics, float]:
     """A run as `statistics`, and how far a twin of it, begun elsewhere and with the same losses, is in the end.
 
     That is the distance of the two AGVs in (x, y, theta) [m, m, rad] as a multiple of what it was at the beginning: a
@@ -448,6 +458,7 @@ def statistics_of_twins(reference: Rows, inputs: RunInputs, twin: Loop) -> tuple
         now = reference_at(reference, k)
         compared = compared_reference(now, reference, k, inputs.settings.ahead)
         run = proceed(run, k, now, compared, inputs)
+        squares[k] = run.square
         if not ends:
             twin, sent = slot(twin, compared, inputs, k)
             ends = not goes_on(twin, sent)

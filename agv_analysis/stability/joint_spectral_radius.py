@@ -307,7 +307,7 @@ def _log_euclidean_norms(maps: Floats) -> Floats:
     if maps.shape[-1] == 3:
         compiled(_fill_in_squares)(maps, squares)
     else:
-        squares = np.linalg.eigvalsh(np.swapaxes(maps, 1, 2) @ maps)[:, -1]
+        squares[:] = np.linalg.eigvalsh(np.swapaxes(maps, 1, 2) @ maps)[:, -1]
     with np.errstate(divide="ignore"):  # a burst that leaves nothing of the error: -inf
         return np.asarray(0.5 * np.log(np.maximum(squares, 0.0)))
 
@@ -343,4 +343,4 @@ def _largest_eigenvalue(S: Floats) -> float:
     spread = math.sqrt((a * a + b * b + c * c + 2.0 * (p * p + q * q + r * r)) / 6.0)
     det = a * (b * c - r * r) - p * (p * c - r * q) + q * (p * r - b * q)
     cos3 = min(1.0, max(-1.0, det / max(2.0 * spread * spread * spread, 1e-300)))
-    return mean + 2.0 * spread * math.cos(math.acos(cos3) / 3.0)
+    return float(mean + 2.0 * spread * math.cos(math.acos(cos3) / 3.0))

@@ -93,12 +93,12 @@ def _orthogonalised_pass(factors: Floats, basis: Floats, logs: Floats) -> None:
 
 def row_count(A: Floats) -> int:
     """Number of rows of a matrix, asked by the functions below; see `of_size_3`."""
-    return A.shape[0]
+    return len(A)
 
 
 def column_count(A: Floats) -> int:
     """Number of its columns."""
-    return A.shape[1]
+    return int(A.shape[1])
 
 
 def three(_: Floats) -> int:

@@ -31,7 +31,7 @@ def burst_maps(loop: LinearLoop, longest: int, begins: NDArray[np.int64] | None 
 
 def burst_maps_in(loop: LinearLoop, basis: Floats, longest: int, begins: NDArray[np.int64]) -> Iterator[Floats]:
     """As `burst_maps`, of S z in place of z: S M_L inv(S), with an invertible `basis` S, shape (m, m)."""
-    inverse, K = np.linalg.inv(basis), loop.K
+    inverse, K = np.asarray(np.linalg.inv(basis), dtype=np.float64), loop.K
     F, G = np.ascontiguousarray(basis @ loop.F @ inverse), np.ascontiguousarray(basis @ loop.G)
     return _bursts(F, G, loop.H, None if K is None else np.ascontiguousarray(K @ inverse), inverse, begins, longest)
 

@@ -16,7 +16,8 @@ Seeds are paired: under one seed all points with the same channel meet the same 
 
 METRICS = (
     "settle_1cm_steps", "settle_2pct_steps", "overshoot", "iae", "ise", "peak", "final", "position_peak",
-    "position_final", "deviation_max", "deviation_rms", "speed_max", "n_ul_max", "n_ul_mean",
+    "position_final", "deviation_max", "deviation_p99", "deviation_rms", "speed_max", "n_ul_max",
+    "n_ul_mean",
 )  # fmt: skip
 """Metrics of which a point has the median (_p50) and the 95th percentile (_p95) over the seeds."""
 

@@ -11,6 +11,7 @@ import pytest
 
 from agv_analysis.metrics.convergence import convergence
 from agv_analysis.metrics.deviation import SMALLEST, deviation
+from agv_analysis.metrics.order_statistics import not_exceeded
 from agv_analysis.run import Run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
@@ -71,6 +72,7 @@ def test_figures_of_a_lap_by_counting() -> None:
     assert found.worst[0].outage.slots == 28
     row = simulate_batch([run.scenario], [run.scenario.relay.seed])[0, 0]
     assert float(row["deviation_max"]) == found.largest
+    assert float(row["deviation_p99"]) == pytest.approx(found.p99, rel=1e-12)
     assert float(row["deviation_rms"]) == pytest.approx(found.rms, rel=1e-12)
     assert float(row["speed_max"]) == found.speed
 
@@ -80,7 +82,17 @@ def test_a_delayed_run_in_a_batch_has_the_same_figures() -> None:
     found = deviation(run, convergence(run).initial)
     row = simulate_batch([run.scenario], [run.scenario.relay.seed])[0, 0]
     assert float(row["deviation_max"]) == found.largest
+    assert float(row["deviation_p99"]) == pytest.approx(found.p99, rel=1e-12)
     assert float(row["deviation_rms"]) == pytest.approx(found.rms, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "values", [[0.0] * 5, [3.0], [1.0] * 99 + [2.0], [1.0] * 98 + [2.0, 3.0], [0.0] * 999 + [1.0], [*range(1000)]]
+)
+def test_what_a_share_does_not_exceed_is_counted(values: list[float]) -> None:
+    shuffled = np.random.default_rng(1).permutation(np.array(values, dtype=np.float64))
+    assert not_exceeded(shuffled, 0.99) == sorted(values)[math.ceil(0.99 * len(values)) - 1]
+    assert not_exceeded(np.array([1.0, math.nan]), 0.99) == math.inf
 
 
 def test_without_losses_there_is_nothing_to_list() -> None:

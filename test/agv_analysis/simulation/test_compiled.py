@@ -58,10 +58,14 @@ def test_compiled_and_plain_agree_to_the_last_bit(settings: tuple[str, ...]) -> 
     assert history(reference, plain, rows, n_ul) == steps
     assert rows.tobytes() == np.hstack([run.pose, run.error, run.command]).tobytes()
     assert n_ul.tolist() == run.n_ul.tolist()
-    assert statistics(reference, plain) == compiled(statistics)(run.reference, fast)
+    squares, others, more = np.zeros((3, steps))
+    assert statistics(reference, plain, squares) == compiled(statistics)(run.reference, fast, others)
+    assert squares.tobytes() == others.tobytes()
     slower = fast._replace(settings=numbers._replace(gains=(5.0, *numbers.gains[1:])))
-    both = compiled(statistics_of_two)(run.reference, fast, slower)
-    assert both == (compiled(statistics)(run.reference, fast), compiled(statistics)(run.reference, slower))
+    both = compiled(statistics_of_two)(run.reference, fast, slower, others, more)
+    one, other = (compiled(statistics)(run.reference, inputs, squares) for inputs in (fast, slower))
+    assert both == (one, other)
+    assert squares.tobytes() == more.tobytes() != others.tobytes()
 
 
 WITHOUT_NUMBA = """
