@@ -12,7 +12,7 @@ from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.leaving import Leaving, chain_alone, is_random, leaving
 from agv_analysis.corridor.outage_sequences import WorstSequence, largest_n
 from agv_analysis.corridor.outer_tube import Tube, applies_to, with_remainder
-from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, single_outage
+from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, roughly, single_outage
 from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stationary_deviation
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.json_values import finite
@@ -30,6 +30,10 @@ _DIVERGED = 1e3
 """Share of a corridor beyond which a loop without losses is not at any place."""
 
 LOOKS_AHEAD = "the law looks ahead, so that the loop's errors are not the AGV's deviation"
+
+NOT_ALONE = "messages take time or depend on the place, so that there are not outages alone"
+
+_NEVER_SETTLES = "the loop does not settle even without losses"
 
 _NOT_ASKED = "not asked for"
 
@@ -181,9 +185,9 @@ def corridor(
     loop, single, sequence, n_any, why, reason = LapLoop(scenario, widths), None, None, None, "", ""
     n_proved, tube, covering, why_no_tube = None, None, None, "" if proved else _NOT_ASKED
     if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
-        reason = "messages take time or depend on the place, so that there are not outages alone"
+        reason = NOT_ALONE
     elif not loop.loss_free_share < _DIVERGED:
-        reason = "the loop does not settle even without losses"
+        reason = _NEVER_SETTLES
     else:
         progress("single outages")
         single = single_outage(loop)
@@ -198,6 +202,23 @@ def corridor(
         widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, *_stationary(loop), found,
         loop.lap, reason, tuple(_notes(loop, single)),
     )  # fmt: skip
+
+
+def rough_tube(loop: LapLoop) -> tuple[Tube | None, str]:
+    """The tube of the linear loop for any outages up to n, n no more than `roughly` a single one may have; a remark.
+
+    Without a tube the remark says why. No sequences are tried before it, so that it comes in a second or two.
+    """
+    relay = loop.scenario.relay
+    if not (relay.uplink.is_direct and relay.downlink.is_direct):
+        return None, f"no tube: {NOT_ALONE}"
+    if not loop.loss_free_share < _DIVERGED:
+        return None, f"no tube: {_NEVER_SETTLES}"
+    n = roughly(loop)
+    _, tube, _, why = _tubes(loop, _LONGEST_ANY if n is None else min(n, _LONGEST_ANY), second_order=False)
+    if tube is None:
+        return None, f"no tube: {why or 'it is left without any outage'}"
+    return tube, "of the linear loop"
 
 
 def _any_outages(loop: LapLoop, single: SingleOutage) -> tuple[int | None, WorstSequence | None, str]:
@@ -220,8 +241,8 @@ def _longest_any(single: SingleOutage) -> int:
     return _LONGEST_ANY if single.n is None else min(single.n, _LONGEST_ANY)
 
 
-def _tubes(loop: LapLoop, longest: int) -> tuple[int | None, Tube | None, Tube | None, str]:
-    """The largest n that is proved, its tube, that with the second order, and why there is none."""
+def _tubes(loop: LapLoop, longest: int, second_order: bool = True) -> tuple[int | None, Tube | None, Tube | None, str]:
+    """The largest n that is proved, its tube, that with the second order if asked for, and why there is none."""
     if loop.scenario.controller.steps_ahead:
         return None, None, None, LOOKS_AHEAD
     try:
@@ -231,7 +252,7 @@ def _tubes(loop: LapLoop, longest: int) -> tuple[int | None, Tube | None, Tube |
     if not applies_to(linear):
         return None, None, None, "computed for loops without states beside the pose, on a track that is driven"
     n, tube = tubes.largest_n(loop, linear, longest)
-    return n, tube, None if tube is None else with_remainder(loop, linear, tube), ""
+    return n, tube, with_remainder(loop, linear, tube) if tube is not None and second_order else None, ""
 
 
 def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:

@@ -7,7 +7,8 @@ import signal
 from collections.abc import Callable
 from typing import Any
 
-from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows
+from agv_analysis.corridor.widths import widths_of
+from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows, tube_traces
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, values_of
 from agv_analysis.explore.sliders import (
@@ -59,6 +60,9 @@ table:has(td + td)::before {
 CriteriaRows = Callable[[Scenario, Scenario | None], list[tuple[str, str, str]] | None]
 """As `compared_criteria_rows`; None if the setting was moved on before its turn came."""
 
+TubeTraces = Callable[[Scenario], list[dict[str, Any]] | None]
+"""As `tube_traces`; None as of CriteriaRows."""
+
 _REST = 0.3
 """Seconds for which the page has to be left alone before the lap's criteria are computed."""
 
@@ -71,8 +75,8 @@ A browser compiles what it has run some times: so it has before a hand moves the
 _MOVED_ON = [("Not computed", "the page was moved on", "")]
 
 
-def build(base: Scenario, criteria: CriteriaRows = compared_criteria_rows) -> Any:
-    """The page as a Dash app; `criteria` may take its time. Raises UserError if Dash is not installed."""
+def build(base: Scenario, criteria: CriteriaRows = compared_criteria_rows, tube: TubeTraces = tube_traces) -> Any:
+    """The page as a Dash app; `criteria` and `tube` may take their time. Raises UserError if Dash is not installed."""
     try:
         dash: Any = importlib.import_module("dash")
     except ImportError:
@@ -80,7 +84,7 @@ def build(base: Scenario, criteria: CriteriaRows = compared_criteria_rows) -> An
     app = dash.Dash("agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets")
     app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
     app.layout = _layout(dash, values_of(base))
-    _connect(dash, app, base, criteria)
+    _connect(dash, app, base, criteria, tube)
     return app
 
 
@@ -145,7 +149,7 @@ def _slider(dcc: Any, slider: Slider, value: float) -> Any:
     return dcc.Slider(slider.low, slider.high, slider.step, value=value, marks=ends, id=slider.key, updatemode="drag")
 
 
-def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows) -> None:
+def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: TubeTraces) -> None:
     Input, Output, State = dash.Input, dash.Output, dash.State
     inputs, states = [Input(key, "value") for key in KEYS], [State(key, "value") for key in KEYS]
 
@@ -182,6 +186,22 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows) -> Non
         except UserError:  # `move` says why
             return [], ""
         return _table(dash.html, _MOVED_ON if found is None else found), ""
+
+    @app.callback(
+        Output("plot-track", "figure", allow_duplicate=True), Input("lap", "children"), *states,
+        prevent_initial_call=True,
+    )  # fmt: skip
+    def draw_tube(_: Any, *given: Any) -> Any:  # after the criteria, on the track as `move` drew it
+        try:
+            scenario = scenario_of(base, values(given))
+            found = None if widths_of(scenario.error_detector) is None else tube(scenario)
+        except UserError:  # `move` says why
+            found = None
+        if not found:
+            return dash.no_update
+        figure = dash.Patch()
+        figure["data"].extend(found)
+        return figure
 
     @app.callback(
         Output("pinned", "data"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"), *states,
@@ -224,8 +244,8 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
 
     Raises UserError if the port is taken or Dash is not installed.
     """
-    criteria = LatestOnlyWorker(compared_criteria_rows, rest=_REST)
-    app = build(base, criteria)
+    criteria, tube = LatestOnlyWorker(compared_criteria_rows, rest=_REST), LatestOnlyWorker(tube_traces)
+    app = build(base, criteria, tube)
     werkzeug: Any = importlib.import_module("werkzeug.serving")
     lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections
     quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
@@ -241,4 +261,5 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
         pass
     finally:
         criteria.close()
+        tube.close()
         server.server_close()

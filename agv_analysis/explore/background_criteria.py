@@ -11,7 +11,7 @@ from collections.abc import Callable
 from multiprocessing import resource_tracker
 from typing import Any, Generic, TypeVar
 
-from agv_analysis.explore.response import with_channel_of
+from agv_analysis.explore.response import MOST_POINTS, with_channel_of
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -52,6 +52,28 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
         return [*found, *(() if within is None else within.rows()), *margin_rows(scenario)]
     except UserError:
         return []
+
+
+def tube_traces(scenario: Scenario) -> list[dict[str, Any]]:
+    """The edges of a scenario's corridor along the track, and of a tube in it, as traces of plotly.js; [] without one.
+
+    The tube is that of the linear loop, for no longer outages than a single one may be by some places of the lap.
+    """
+    from agv_analysis.corridor.corridor import rough_tube
+    from agv_analysis.corridor.lap_loop import LapLoop
+    from agv_analysis.corridor.widths import widths_of
+    from agv_analysis.report.corridor_panels import edges_along
+    from agv_analysis.report.plotly import traces
+
+    widths = widths_of(scenario.error_detector)
+    if widths is None:
+        return []
+    try:
+        loop = LapLoop(scenario, widths)
+        tube, remark = rough_tube(loop)
+    except UserError:
+        return []
+    return traces(edges_along(loop.lap, widths, tube, remark), MOST_POINTS)
 
 
 def _growth(factor: float) -> str:

@@ -24,7 +24,7 @@ from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.criterion import RunFacts
 from agv_ros.parameters import SHARED
 
-_MOST_POINTS = 1200
+MOST_POINTS = 1200
 """Points of a line: the lowest and the highest of each pixel or two."""
 
 _MOST_MARKERS = 100
@@ -49,8 +49,8 @@ def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
     values = list(summary_rows(run))
     others = values_of_other or {}
     return Response(
-        track=figure([first], _MOST_POINTS, markers=_MOST_MARKERS),
-        time=figure(over_time, _MOST_POINTS),
+        track=figure([first], MOST_POINTS, markers=_MOST_MARKERS),
+        time=figure(over_time, MOST_POINTS),
         rows=[(name, value, others.get(name, "")) for name, value in values],
     )
 

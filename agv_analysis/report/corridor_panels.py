@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 from agv_analysis.corridor.corridor import Corridor
+from agv_analysis.corridor.outer_tube import Tube
+from agv_analysis.corridor.widths import Widths
 from agv_analysis.report.panels import DRIVEN, LIMIT, OTHER, Line, Panel
 from agv_analysis.run import Floats
 
@@ -28,10 +30,17 @@ def corridor_panel(found: Corridor) -> Panel:
 
 def edges(found: Corridor) -> tuple[Line, ...]:
     """The corridor's edges along a lap, and those of the tube, as lines on the track."""
-    lines = [_edge("corridor", found.lap, np.full(len(found.lap), found.widths.half_width), LIMIT)]
-    if found.tube is not None:
-        name = f"tube for any outages up to {found.tube.n} slots"
-        lines.append(_edge(name, found.lap, _of_lap(found.tube.distance, len(found.lap)), OTHER))
+    return edges_along(found.lap, found.widths, found.tube)
+
+
+def edges_along(lap: Floats, widths: Widths, tube: Tube | None, remark: str = "") -> tuple[Line, ...]:
+    """The same of a lap, shape (N, 5), with a remark on the tube, or on why there is none."""
+    remark = f" ({remark})" if remark else ""
+    name = "corridor" if tube is not None else f"corridor{remark}"
+    lines = [_edge(name, lap, np.full(len(lap), widths.half_width), LIMIT)]
+    if tube is not None:
+        name = f"tube for any outages up to {tube.n} slots{remark}"
+        lines.append(_edge(name, lap, _of_lap(tube.distance, len(lap)), OTHER))
     return tuple(lines)
 
 

@@ -58,7 +58,7 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST
     print they stay sharp.
     """
     rows = len(panels)
-    traces: list[dict[str, Any]] = []
+    found: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
         "margin": {"l": 60, "r": 12, "t": 32, "b": 44},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -77,8 +77,13 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST
         layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel)}
         layout[f"legend{number}"] = {"orientation": "h", "x": 0.0, "y": top, "yanchor": "bottom"}
         of_row = {"yaxis": f"y{number}", "legend": f"legend{number}"}
-        traces += [_trace(line, most, markers) | of_row for line in panel.lines]
-    return {"data": traces, "layout": layout}
+        found += [_trace(line, most, markers) | of_row for line in panel.lines]
+    return {"data": found, "layout": layout}
+
+
+def traces(lines: Sequence[Line], most: int = MOST_POINTS) -> list[dict[str, Any]]:
+    """Lines to be added to a figure of one panel."""
+    return [_trace(line, most, MOST_MARKERS) | {"yaxis": "y", "legend": "legend"} for line in lines]
 
 
 def _y_axis(panel: Panel) -> dict[str, Any]:

@@ -20,7 +20,13 @@ from urllib.request import Request, urlopen
 import numpy as np
 import pytest
 
-from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows, criteria_rows
+from agv_analysis.corridor.corridor import NOT_ALONE
+from agv_analysis.explore.background_criteria import (
+    LatestOnlyWorker,
+    compared_criteria_rows,
+    criteria_rows,
+    tube_traces,
+)
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
 from agv_analysis.explore.sliders import gain_slider
@@ -133,6 +139,16 @@ def test_a_corridor_is_answered_at_every_move(base: Scenario) -> None:
     assert found["One outage in the corridor"].startswith("about 27 slots")
     pinned = {name: other for name, _, other in respond(with_corridor, base).rows}
     assert pinned["One outage in the corridor"] == ""
+
+
+def test_a_tube_is_drawn_along_the_track_once_it_is_known(base: Scenario) -> None:
+    assert tube_traces(base) == []
+    on_a_line = base.with_settings(["error_detector.corridor=0.25", "error_detector.track=line"])
+    edge, tube = tube_traces(on_a_line)
+    assert edge["name"] == "corridor"
+    assert tube["name"] == "tube for any outages up to 14 slots (of the linear loop)"  # 15 let errors grow
+    late = on_a_line.with_settings(["relay.uplink.delay=0.05"])
+    assert [trace["name"] for trace in tube_traces(late)] == [f"corridor (no tube: {NOT_ALONE})"]
 
 
 def test_both_runs_are_drawn(base: Scenario) -> None:
