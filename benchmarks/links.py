@@ -1,10 +1,11 @@
-"""Measured links: text formats against a regular expression over the same lines and against pyarrow's CSV reader.
+"""Measured links: text formats against a regular expression over the same lines, pyarrow's CSV reader, the JSON module.
 
 Ours names what is no record, finds packets that are missing and dates all of them, which the peers do not.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
 import time
@@ -15,16 +16,16 @@ from agv_analysis.link.formats import read_link
 from agv_analysis.link.formats.format import Options
 from benchmarks.comparison import Comparison
 
-RECORDS = 500_000
+RECORDS, TRIPS = 500_000, 50_000
 _PING = re.compile(rb"^\[([\d.]+)\] \d+ bytes from [^:]*: icmp_seq=(\d+) ttl=\d+ time=([\d.]+) ms", re.MULTILINE)
 
 
 def measure() -> list[Comparison]:
-    """Records a second of a ping log and of a table."""
+    """Records a second of a ping log, of irtt's raw lines, of a table, and of irtt's JSON."""
     import pyarrow.csv
 
     with tempfile.TemporaryDirectory() as folder:
-        log, table = Path(folder) / "ping.txt", Path(folder) / "table.csv"
+        log, raw, table, trips = (Path(folder) / name for name in ("ping.txt", "raw.txt", "table.csv", "irtt.json"))
         kept = [i for i in range(RECORDS) if i % 97]
         log.write_text(
             "".join(
@@ -35,14 +36,21 @@ def measure() -> list[Comparison]:
         table.write_text(
             "time,lost,delay\n" + "".join(f"{0.02 * i:.3f},{int(i % 97 == 0)},0.0125\n" for i in range(RECORDS))
         )
-        ours = [_rate(lambda path=path: read_link(path, Options())) for path in (log, table)]  # type: ignore[misc]
+        raw.write_text("".join(f"{i} {5 + i % 7 / 10:f} 2.500000 2.500000 0.010000 0 0\n" for i in kept))
+        trips.write_text(json.dumps({"round_trips": [_trip(i) for i in range(TRIPS)]}, indent=4))
+        ours = [_rate(lambda path=path: read_link(path, Options())) for path in (log, raw, table)]  # type: ignore[misc]
+        ours.append(_rate(lambda: read_link(trips, Options()), TRIPS))
         peers = [
             _rate(lambda: [tuple(map(float, found)) for found in _PING.findall(log.read_bytes())]),
+            _rate(lambda: [tuple(map(float, line.split())) for line in raw.read_bytes().splitlines()]),
             _rate(lambda: pyarrow.csv.read_csv(table)),
+            _rate(lambda: json.loads(trips.read_bytes()), TRIPS),
         ]
     rows = (
         ("log of ping", "re.findall, as floats", 2.0),
+        ("irtt -r", "line.split, as floats", 1.5),
         ("table of three columns", "pyarrow.csv, columns alone", None),
+        ("irtt's JSON, by msgspec", "json.loads alone, as dicts", 1.0),
     )
     return [
         Comparison(what, one, name, peer, "records/s", aim)
@@ -50,11 +58,19 @@ def measure() -> list[Comparison]:
     ]
 
 
-def _rate(work: Callable[[], object]) -> float:
+def _trip(i: int) -> dict[str, object]:
+    """A round trip as irtt writes it."""
+    stamp = {"wall": 1_700_000_000_000_000_000 + 20_000_000 * i, "monotonic": 20_000_000 * i}
+    both = {"receive": stamp, "send": stamp}
+    delay = {"receive": 2_500_000, "rtt": 5_012_345, "send": 2_512_345}
+    return {"seqno": i, "lost": "false", "timestamps": {"client": both, "server": both}, "delay": delay, "ipdv": delay}
+
+
+def _rate(work: Callable[[], object], records: int = RECORDS) -> float:
     """Records a second of the best of three."""
     best = float("inf")
     for _ in range(3):
         begin = time.perf_counter()
         work()
         best = min(best, time.perf_counter() - begin)
-    return RECORDS / best
+    return records / best

@@ -84,6 +84,7 @@ def _packets(path: Path, malformed: Malformed, progress: Progress | None) -> Ite
     """The UDP packets of a capture, in its order. Raises MeasurementError if it is none."""
     dpkt = _dpkt()
     size = max(1, path.stat().st_size)
+    _needs_one_kind_of_interface(path)
     with open_binary(path) as file:
         try:
             reader = dpkt.pcap.UniversalReader(file)
@@ -108,10 +109,58 @@ def _packets(path: Path, malformed: Malformed, progress: Progress | None) -> Ite
             malformed.add(number + 1, b"the capture ends within a packet")
 
 
+def _needs_one_kind_of_interface(path: Path) -> None:
+    """Raises MeasurementError for a pcapng with links or clocks of several kinds, of which dpkt knows the first."""
+    kinds = set()
+    with open_binary(path) as file:
+        if file.read(4) != _MAGICS[-1]:
+            return
+        file.seek(8)
+        order = "<" if file.read(4) == b"\x4d\x3c\x2b\x1a" else ">"
+        file.seek(0)
+        while len(head := file.read(8)) == 8:
+            kind, length = struct.unpack(f"{order}II", head)
+            if length < 12:
+                break
+            if kind == _INTERFACE:
+                body = file.read(length - 8)
+                kinds.add((body[:2], _resolution(body[8:-4], order)))
+            else:
+                file.seek(length - 8, 1)
+    if len(kinds) > 1:
+        raise MeasurementError(
+            f"{path}: has packets of {len(kinds)} kinds of interfaces: write those of one to a file of their own, as "
+            "with tshark -r FILE -Y 'frame.interface_id == 0' -w ONE"
+        )
+
+
+_INTERFACE, _RESOLUTION = 1, 9
+"""Block that describes an interface, and its option that says in what unit times are."""
+
+
+def _resolution(options: bytes, order: str) -> bytes:
+    """What a description says of the unit of times; empty if it says nothing."""
+    at = 0
+    while at + 4 <= len(options):
+        code, length = struct.unpack_from(f"{order}HH", options, at)
+        if code == _RESOLUTION:
+            return options[at + 4 : at + 4 + length].replace(b"\x06", b"")  # microseconds are meant where none is said
+        if code == 0:
+            break
+        at += 4 + length + -length % 4
+    return b""
+
+
+def _ip(data: bytes) -> Any:
+    """A packet of IP without a frame about it, of either version."""
+    dpkt = _dpkt()
+    return dpkt.ip6.IP6(data) if data[0] >> 4 == 6 else dpkt.ip.IP(data)
+
+
 def _decoder(dpkt: Any, datalink: int, path: Path) -> Any:
     known = {
         dpkt.pcap.DLT_EN10MB: dpkt.ethernet.Ethernet, dpkt.pcap.DLT_NULL: dpkt.loopback.Loopback,
-        dpkt.pcap.DLT_LINUX_SLL: dpkt.sll.SLL, 12: dpkt.ip.IP, 101: dpkt.ip.IP, 228: dpkt.ip.IP, 229: dpkt.ip6.IP6,
+        108: dpkt.loopback.Loopback, dpkt.pcap.DLT_LINUX_SLL: dpkt.sll.SLL, 12: _ip, 101: _ip, 228: _ip, 229: _ip,
         276: dpkt.sll2.SLL2,
     }  # fmt: skip
     if datalink not in known:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -118,3 +118,48 @@ def test_a_capture_that_was_cut_off_keeps_what_is_whole(tmp_path: Path) -> None:
     path = write(tmp_path / "x.pcap", [(1.0 + i, frame(rtps(i + 1))) for i in range(4)])
     path.write_bytes(path.read_bytes()[:-20])
     assert measured(path).packets == 3
+
+
+def ip6(payload: bytes) -> bytes:
+    udp = dpkt.udp.UDP(sport=5000, dport=7411, data=payload)
+    udp.ulen = len(udp)
+    address = b"\xfe\x80" + bytes(13)
+    ip = dpkt.ip6.IP6(src=address + b"\x01", dst=address + b"\x02", nxt=dpkt.ip.IP_PROTO_UDP, data=udp)
+    ip.plen = len(udp)
+    return bytes(ip)
+
+
+FRAMES: dict[str, tuple[int, Callable[[bytes], bytes]]] = {
+    "vlan": (1, lambda payload: frame(payload)[:12] + b"\x81\x00\x00\x05" + frame(payload)[12:]),
+    "ipv6": (1, lambda payload: frame(payload)[:12] + b"\x86\xdd" + ip6(payload)),
+    "any device": (113, lambda payload: struct.pack(">HHH8sH", 0, 1, 6, b"\x01" * 8, 0x0800) + frame(payload)[14:]),
+    "no frame": (101, lambda payload: frame(payload)[14:]),
+    "no frame, ipv6": (101, ip6),
+    "loopback": (108, lambda payload: struct.pack(">I", 2) + frame(payload)[14:]),
+}
+
+
+@pytest.mark.parametrize("kind", list(FRAMES))
+def test_whatever_is_about_a_packet(tmp_path: Path, kind: str) -> None:
+    """A pcap with times in nanoseconds and the other order of bytes, of each kind of link."""
+    link, around = FRAMES[kind]
+    head = struct.pack(">IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, link)
+    packets = [(i, around(rtps(i + 1))) for i in range(N) if i not in LOST]
+    records = [struct.pack(">IIII", 100, 5_000_000 * i, len(data), len(data)) + data for i, data in packets]
+    (tmp_path / "x.pcap").write_bytes(head + b"".join(records))
+    found = measured(tmp_path / "x.pcap")
+    assert set(np.flatnonzero(found.whole.lost).tolist()) == LOST
+    assert found.sent[10] == pytest.approx(0.05, abs=1e-6)
+
+
+def test_a_capture_of_several_kinds_of_interfaces_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "x.pcapng", [(1.0 + i, frame(rtps(i + 1))) for i in range(4)], new=True)
+    content = path.read_bytes()
+    begin = struct.unpack_from("<I", content, 4)[0]
+    end = begin + struct.unpack_from("<I", content, begin + 4)[0]
+    path.write_bytes(content[:end] + content[begin:end] + content[end:])  # the same interface twice does no harm
+    assert measured(path).packets == 4
+    other = content[begin : begin + 8] + struct.pack("<H", 101) + content[begin + 10 : end]
+    path.write_bytes(content[:end] + other + content[end:])
+    with pytest.raises(MeasurementError, match="has packets of 2 kinds of interfaces: write those of one to a file"):
+        read_link(path)
