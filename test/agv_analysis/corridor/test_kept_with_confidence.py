@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from agv_analysis.corridor.kept_with_confidence import kept_with_confidence, quantile
 from agv_ros.errors import UserError
-from test.agv_analysis.corridor.test_single_outage import scenario
+from test.agv_analysis.corridor.test_single_outage import on_a_line, scenario
 
 
 @pytest.mark.parametrize("share", [0.5, 0.95])
@@ -29,8 +31,19 @@ def test_the_narrowest_corridor_and_the_largest_speed_go_together() -> None:
     assert found.speed == pytest.approx(0.25 / found.width.value, rel=0.06)  # bisected to a factor of 16^(2/128)
 
 
+def test_what_hardly_any_lap_shows_is_found_by_splitting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a line: the length of the outages of which one comes in 1e5 laps, and how far one of them leads."""
+    chosen = scenario("error_detector.track=line", "error_detector.corridor=0.25", lap=4.0)
+    monkeypatch.setattr("agv_analysis.corridor.kept_with_confidence._STEPS", 0)  # the speed alone takes a minute
+    found = kept_with_confidence(chosen, 1.0 - 1e-5)
+    longest = 1.0 + math.log(1e-5 / 800 / (0.02 * 0.2 / 0.22)) / math.log(0.8)
+    assert found.width.value == pytest.approx(on_a_line(1) * longest * (longest + 1.0) / 2.0, rel=0.1)
+    assert found.width.low <= found.width.value <= found.width.high <= 1.2 * found.width.low
+    assert found.laps is None
+
+
 def test_what_cannot_be_asked_is_refused() -> None:
-    for settings, confidence in (([], 0.9), (["error_detector.corridor=0.1"], 0.999)):
+    for settings, confidence in (([], 0.9), (["error_detector.corridor=0.1", "relay.uplink.delay=0.01"], 0.999)):
         with pytest.raises(UserError, match=r"corridor|confidence"):
             kept_with_confidence(scenario(*settings), confidence, laps=5)
     of_paper = kept_with_confidence(scenario("error_detector.corridor=0.1", lap=4.0), 0.5, laps=5)
