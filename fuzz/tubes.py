@@ -100,7 +100,7 @@ class Search:
         lengths = self._best.copy()
         places = self._rng.integers(0, _SLOTS // (1 + self.case.n // 2), self._rng.integers(1, 4))
         lengths[places] = self._rng.integers(0, self.case.n + 1, len(places))
-        return lengths
+        return np.asarray(lengths, dtype=np.int64)
 
     def _used(self, outcomes: Outcomes) -> tuple[float, float, int]:
         """Largest share of a bound, largest distance [m], and how many of the runs were outside of the tube."""
