@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -18,18 +19,24 @@ _BORDER_VALUES = 40
 """Values of an axis for a smooth border."""
 
 
+@functools.lru_cache(maxsize=8)
 def border_places(base: Scenario, axis: Axis) -> dict[str, list[float]]:
-    """Where on an axis the borders of stability are crossed, by name of the border, as `margins`."""
+    """Where on an axis the borders of stability are crossed, by name of the border, as `margins`.
+
+    Found once for all pictures of a sweep, which change nothing in it.
+    """
     fine = _between(axis)
     found = margins(base, (axis,), [(value,) for value in fine])
     crossed = {name: np.flatnonzero(margin[:-1] * margin[1:] < 0.0).tolist() for name, margin in found.items()}
     return {name: [0.5 * (fine[i] + fine[i + 1]) for i in places] for name, places in crossed.items()}
 
 
+@functools.lru_cache(maxsize=8)
 def border_maps(base: Scenario, across: Axis, up: Axis) -> tuple[list[float], list[float], dict[str, Floats]]:
     """Values across (M,) and up (N,), and on their grid (N, M) by name of the border how far a point is from it.
 
     The border is where that is zero; only those that cross the grid are there. Signs and NaN are those of `margins`.
+    Found once for all pictures of a sweep, which change nothing in it.
     """
     x, y = _between(across), _between(up)
     found = margins(base, (across, up), [(i, j) for j in y for i in x])
