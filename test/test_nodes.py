@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import math
+import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -50,9 +51,9 @@ NODES: dict[str, type[LoopNode[Any]]] = {
 class Bench:
     """Nodes under test and a probe beside them, in a context and an executor of their own."""
 
-    def __init__(self, executor: str) -> None:
+    def __init__(self, executor: str, domain_id: int | None = None) -> None:
         self.context = rclpy.Context()
-        rclpy.init(context=self.context)
+        rclpy.init(context=self.context, domain_id=domain_id)
         self.executor = EXECUTORS[executor](context=self.context)
         self.probe = Node("probe", context=self.context, use_global_arguments=False)
         self.executor.add_node(self.probe)
@@ -604,26 +605,27 @@ def test_a_waiting_node_ends_cleanly_on_signals(
     assert "Traceback" not in said
 
 
-@pytest.mark.parametrize(
-    ("running", "silent"),
-    [((), "relay"), (("relay",), "error_detector"), (("relay", "error_detector"), "controller")],
-)
-def test_lockstep_names_the_missing_peer(start: Start, running: tuple[str, ...], silent: str) -> None:
-    peers = {
-        "relay": ("agv_plant.relay_node", "edge/slot"),
-        "error_detector": ("agv_cloud.error_detector_node", "edge/error"),
-    }
-    onlooker = Bench("events")
-    for name in running:
-        module, topic = peers[name]
-        start(module)
-        onlooker.until(functools.partial(onlooker.probe.count_publishers, topic))
-    onlooker.close()
-    plant = start("agv_plant.plant_node", "--ros-args", "-p", "answer_timeout:=8.0")
-    status, said = plant.end()
-    assert status == 1
-    assert said.splitlines()[-1] == (f"no answer to step 0 on agv/cmd_vel within 8 s: is the {silent} running?")
-    assert "Traceback" not in said
+def test_lockstep_names_the_missing_peer(start: Start, two_domains: tuple[int, int]) -> None:
+    """Three loops, each in a domain of its own, wait at the same time."""
+    topics = {"relay": "edge/slot", "error_detector": "edge/error"}
+    waiting = {}
+    for domain, running, silent in (
+        (None, (), "relay"),
+        (two_domains[0], ("relay",), "error_detector"),
+        (two_domains[1], ("relay", "error_detector"), "controller"),
+    ):
+        env = os.environ | ({} if domain is None else {"ROS_DOMAIN_ID": str(domain)})
+        onlooker = Bench("events", domain)
+        for name in running:
+            start(next(module for module in NODES if name in module), env=env)
+            onlooker.until(functools.partial(onlooker.probe.count_publishers, topics[name]))
+        onlooker.close()
+        waiting[silent] = start("agv_plant.plant_node", "--ros-args", "-p", "answer_timeout:=8.0", env=env)
+    for silent, plant in waiting.items():
+        status, said = plant.end()
+        assert status == 1
+        assert said.splitlines()[-1] == f"no answer to step 0 on agv/cmd_vel within 8 s: is the {silent} running?"
+        assert "Traceback" not in said
 
 
 @pytest.mark.parametrize("name", ["controller", "error_detector", "relay"])
@@ -631,13 +633,13 @@ def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Sta
     from agv_analysis.recordings.recording import read_run
 
     params = tmp_path / "params.yaml"
-    params.write_text("plant: {ros__parameters: {duration: 10.0, answer_timeout: 60.0}}")
+    params.write_text("plant: {ros__parameters: {duration: 5.0, answer_timeout: 60.0}}")
     arguments = ["--ros-args", "--params-file", str(params), "-p", "wait_for_subscribers:=2"]
     bag = ["-p", f"bag:={tmp_path / 'bag'}", "-p", f"params_file:={params}", "-p", "stop_timeout:=30.0"]
     recorder = start("agv_analysis.runtime.recorder_node", *arguments, *bag, "-p", "log_time:=stamp")
     modules = {kind.rpartition(".")[2].removesuffix("_node"): kind for kind in NODES}
     running = {node: start(module, *arguments) for node, module in modules.items()}
-    running["plant"].wait_for("step 500 of")
+    running["plant"].wait_for("step 250 of")
     running[name].process.send_signal(signal.SIGTERM)
     assert running[name].end()[0] == 0
     running[name] = start(modules[name], *arguments)
@@ -649,7 +651,7 @@ def test_a_node_that_is_started_again_goes_on_and_the_recording_tells(start: Sta
         assert (status, "Traceback" in said) == (0, False)
     assert f"started again: {name}" in said
     run = read_run(tmp_path / "bag")
-    assert len(run) == 2000
+    assert len(run) == 1000
     assert abs(run.reference[-1, 1] - run.pose[-1, 1]) < 0.01
     assert [note for note in run.notes if note.startswith(f"{name} was started again")]
     assert not [note for note in run.notes if "was started again" in note and not note.startswith(name)]
