@@ -13,6 +13,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Iterator
+from pathlib import Path
 from typing import IO
 
 
@@ -50,5 +51,7 @@ def run_command(words: list[str]) -> tuple[int, str]:
 
 
 if __name__ == "__main__":
+    # This folder holds folders that are called as the packages are; those of another environment come first.
+    sys.path.append(str(Path(sys.path.pop(0)).parent))
     for line in sys.stdin:
         print("done:", json.dumps(run_command(json.loads(line))), flush=True)
