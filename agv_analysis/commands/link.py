@@ -151,6 +151,8 @@ def show_measurement(
     from agv_analysis.link.measured_trace import link_of_loop, write_trace
 
     found, link = LinkFigures(measured), link_of_loop(measured, rtt)
+    with _busy("working out the figures ..."):
+        figures = found.to_json()
     console.print(
         f"[bold]{escape(measured.source)}[/]: {measured.format}, {measured.packets} packets in {measured.span:.6g} s, "
         f"one every {1e3 * measured.interval:.6g} ms",
@@ -166,7 +168,7 @@ def show_measurement(
         console.print(sentence, soft_wrap=True)
     for note in (*measured.notes, *measured.malformed.sentences(), *link.notes):
         console.print(f"[bold yellow]Note:[/] {escape(note)}.", soft_wrap=True)
-    content = {**found.to_json(), "assumed": list(link.notes)}
+    content = {**figures, "assumed": list(link.notes)}
     if trace is not None:
         write_trace(trace, link)
         console.print(f"trace:   {trace}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -268,3 +269,25 @@ def test_formats_are_told_apart(tmp_path: Path) -> None:
     ):  # fmt: skip
         (tmp_path / "a").write_text(text)
         assert format_of(tmp_path / "a").name == name
+
+
+@pytest.mark.parametrize(
+    ("line", "bytes_each"),
+    [
+        ("[{0:.3f}] 64 bytes from 10.0.0.2: icmp_seq={1} ttl=64 time=5.25 ms\n", 17.0),
+        ("{1} 5.25 2.5 2.75 0.01 0 0\n", 34.0),
+        ("{0:.3f},0,0.005\n", 17.0),
+    ],
+)
+def test_of_a_packet_its_figures_are_kept_and_nothing_else(tmp_path: Path, line: str, bytes_each: float) -> None:
+    """When it was sent, each delay, and a byte for each outcome; columns have an eighth more room at most."""
+    path, count = tmp_path / "a", 60_000
+    lines = (line.format(0.02 * i, i) for i in range(count) if i % 50)
+    path.write_text(("time,lost,delay\n" if line.startswith("{0") else "") + "".join(lines))
+    read_link(path)  # what is imported and kept once
+    tracemalloc.start()
+    found = read_link(path)
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert isinstance(found, Measurement)
+    assert kept / count < 1.25 * bytes_each
