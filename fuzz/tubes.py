@@ -37,7 +37,8 @@ POLICIES = {
 
 _HALF_WIDTH = 2.0
 _PLACES, _SLOTS = 200, 600
-_ROUNDING = 1e-9
+_ROUNDING, _SMALL = 1e-9, 1e-6
+"""What is no departure, and bounds of which no share is taken [m, m, rad times the lever]."""
 
 
 @dataclass
@@ -97,7 +98,7 @@ class Search:
 
     def _changed(self) -> Lengths:
         """The best lengths so far, some of the first ones changed."""
-        lengths = self._best.copy()
+        lengths: Lengths = np.array(self._best)
         places = self._rng.integers(0, _SLOTS // (1 + self.case.n // 2), self._rng.integers(1, 4))
         lengths[places] = self._rng.integers(0, self.case.n + 1, len(places))
         return np.asarray(lengths, dtype=np.int64)
@@ -110,7 +111,7 @@ class Search:
         deviation = paths[:_PLACES] - tube.nominal[rows]
         reached, bounds = deviation @ tube.template.directions.T, tube.bounds[rows]
         is_outside = ~(reached <= bounds + _ROUNDING).all(axis=(1, 2))
-        shares = np.where(bounds > 1e-3 * bounds.max(), reached / np.maximum(bounds, 1e-300), 0.0)
+        shares = np.where(bounds > max(_SMALL, 1e-3 * bounds.max()), reached / np.maximum(bounds, 1e-300), 0.0)
         return float(shares.max()), float(np.hypot(paths[..., 0], paths[..., 1]).max()), int(is_outside.sum())
 
 

@@ -206,7 +206,9 @@ def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Pa
         raise UserError(f"--map takes two axes with a comma between them, as in kx,ts; got {axes!r}")
     first, second = ranges_of(scenario, names, points)
     with step_bar(points * points, "computing the map") as progress:
-        found = with_corridor(margin_map(scenario, (names[0], names[1]), first, second, progress), scenario)
+        found = margin_map(scenario, (names[0], names[1]), first, second, progress)
+    with step_bar(points * points, "within the corridor") as progress:
+        found = with_corridor(found, scenario, progress)
     write_csv(csv_file, found)
     draw(picture, found)
     click.echo(f"map:     {csv_file}\npicture: {picture}")

@@ -6,7 +6,7 @@ own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,15 +109,19 @@ def margin_map(
     )  # fmt: skip
 
 
-def _of_place(scenario: Scenario, place: dict[str, float]) -> list[int]:
+def _of_place(scenario: Scenario, place: Mapping[str, float]) -> list[int]:
     """The margins of one point; -1 where the loop does not settle even without losses."""
-    law = scenario.controller.law
-    prefix = "controller" if law == KANAYAMA else f"controller.{law}"
-    gains = [f"{prefix}.{known.name}={place[known.name]!r}" for known in CONTROL_LAWS.find(law).parameters]
     v = place[SPEED]
     try:
-        at_place = scenario.with_settings([*gains, f"plant.ts={place[TS]!r}"], "the map")
-        loop = linear_loop(at_place, np.array([v]), np.array([v * place[CURVATURE]]))
+        loop = linear_loop(scenario_at(scenario, place), np.array([v]), np.array([v * place[CURVATURE]]))
     except NoNominalMotionError:
         return [-1] * len(map_columns())
     return [column.of_loop(loop) for column in map_columns()]
+
+
+def scenario_at(scenario: Scenario, place: Mapping[str, float]) -> Scenario:
+    """The scenario with the gains and the period of a point of its map; its track is as it was."""
+    law = scenario.controller.law
+    prefix = "controller" if law == KANAYAMA else f"controller.{law}"
+    gains = [f"{prefix}.{known.name}={place[known.name]!r}" for known in CONTROL_LAWS.find(law).parameters]
+    return scenario.with_settings([*gains, f"plant.ts={place[TS]!r}"], "the map")

@@ -32,10 +32,33 @@ def test_points_say_what_single_scenarios_say() -> None:
             assert found.margins[P_HOUR][i, j] == pytest.approx(-math.expm1(-rate * 720_000))
 
 
-def test_what_has_no_closed_form_is_refused_and_no_corridor_changes_nothing() -> None:
+def test_without_a_closed_form_each_point_is_driven() -> None:
+    """Along a line the plant that integrates along the arc is Euler's, but for the margins it has no closed form."""
+    gains, speeds = np.array([5.0, 25.0]), np.array([0.5, 2.0])
+    closed, driven = (
+        with_corridor(margin_map(base, ("kx", "v"), gains, speeds), base).margins[N_ANY]
+        for base in (scenario(*CHOSEN), scenario(*CHOSEN, "plant.integration=arc"))
+    )
+    np.testing.assert_array_equal(driven, closed)
+
+
+def test_behind_a_predictor_an_outage_leads_as_far_as_the_model_errs() -> None:
+    """delta v T_s n, nearly, while the AGV is told to drive at v but drives at (1 + delta) v."""
+    base = scenario(*CHOSEN, "error_detector.policy=predict", "plant.speed_scale=1.1")
+    found = with_corridor(margin_map(base, ("v", "curvature"), np.array([2.0]), np.array([0.0, 0.1])), base)
+    speed = "error_detector.speed=2.0"
+    alone = scenario(*CHOSEN, "error_detector.policy=predict", "plant.speed_scale=1.1", speed)
+    straight, curved = found.margins[N_ANY][0].tolist()
+    assert straight == single_outage(LapLoop(alone, Widths(0.1, math.inf, math.inf))).n
+    assert straight == pytest.approx(0.1 / (0.1 * 2.0 * 0.005), rel=0.1)
+    assert abs(curved - straight) < 20
+    assert (found.margins[P_HOUR] < 1e-5).all()
+
+
+def test_late_messages_are_refused_and_no_corridor_changes_nothing() -> None:
     some = np.array([5.0, 25.0])
     base = scenario("error_detector.track=line")
     of_margins = margin_map(base, ("kx", "ky"), some, some)
     assert with_corridor(of_margins, base) is of_margins
-    with pytest.raises(UserError, match="Kanayama"):
-        with_corridor(of_margins, scenario(*CHOSEN, "plant.lag=0.1"))
+    with pytest.raises(UserError, match="outages alone"):
+        with_corridor(of_margins, scenario(*CHOSEN, "relay.uplink.delay=0.01"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from agv_analysis.corridor.lap_loop import LapLoop
@@ -55,6 +56,23 @@ def test_on_a_line_one_lost_pose_in_two_has_a_closed_form() -> None:
     found = of(scenario(*BERNOULLI, "error_detector.track=line"))
     assert found.rms_along**2 == pytest.approx(square, rel=1e-6)
     assert found.rms_across < 1e-9
+
+
+@pytest.mark.parametrize(("p", "r"), [(0.02, 0.2), (0.02, 0.05)])
+def test_on_a_line_it_is_that_of_a_renewal_process(p: float, r: float) -> None:
+    """Also near the border, where simulated laps hardly show the rare outages that make most of the mean square.
+
+    From one reception to the next, L slots later, x -> (1 - a L) x - a c L (L - 1) / 2; the L are independent.
+    """
+    a, c, longest = 0.125, 0.005, 5000
+    L, i = np.arange(1, longest), np.arange(longest - 1)
+    chance = np.where(L == 1, 1.0 - p, p * r * (1.0 - r) ** np.maximum(L - 2, 0))
+    m, b, m_i, b_i = 1.0 - a * L, -a * c * L * (L - 1) / 2, 1.0 - a * i, -a * c * i * (i - 1) / 2
+    mean = chance @ b / (1.0 - chance @ m)
+    square = (chance @ b**2 + 2.0 * (chance @ (m * b)) * mean) / (1.0 - chance @ m**2)
+    sums = np.cumsum(m_i**2) * square + 2.0 * np.cumsum(m_i * b_i) * mean + np.cumsum(b_i**2)
+    found = of(scenario(f"relay.uplink.p={p}", f"relay.uplink.r={r}", "error_detector.track=line"))
+    assert found.rms_along == pytest.approx(math.sqrt(chance @ sums / (chance @ L)), rel=1e-5)
 
 
 def test_without_losses_and_noise_there_is_none_and_beyond_the_border_no_end() -> None:
