@@ -126,21 +126,34 @@ def of_trace(file: str, link: str, ts: float) -> Measurement:
 
 def write_trace(path: Path, link: LinkOfLoop) -> None:
     """Write a file for the channel `trace`, with times. Raises UserError if it cannot be written."""
-    columns: list[tuple[str, Floats]] = [("time", link.time), ("uplink_lost", link.uplink_lost.astype(np.float64))]
+    columns: list[tuple[str, str]] = [("time", "%.6f"), ("uplink_lost", "%d")]
     if link.uplink_delay is not None:
-        columns.append(("uplink_delay", np.where(link.uplink_lost, np.nan, link.uplink_delay)))
+        columns.append(("uplink_delay", "%.9g"))
     if link.downlink_lost is not None:
-        columns.append(("downlink_lost", link.downlink_lost.astype(np.float64)))
+        columns.append(("downlink_lost", "%d"))
         if link.downlink_delay is not None:
-            columns.append(("downlink_delay", np.where(link.downlink_lost, np.nan, link.downlink_delay)))
-    header = ",".join(name for name, _ in columns)
-    form = ",".join("%d" if name.endswith("_lost") else "%.9g" if name != "time" else "%.6f" for name, _ in columns)
+            columns.append(("downlink_delay", "%.9g"))
+    form = ",".join(how for _, how in columns)
     try:
         with open(path, "w", encoding="utf-8") as file:
-            file.write(header + "\n")
-            table = np.stack([column for _, column in columns], axis=1)
-            for first in range(0, len(table), 65536):
-                rows = table[first : first + 65536].tolist()
-                file.write("\n".join([form % tuple(row) for row in rows]) + "\n")
+            file.write(",".join(name for name, _ in columns) + "\n")
+            for first in range(0, len(link.time), _ROWS):
+                rows = _rows(link, slice(first, first + _ROWS), [name for name, _ in columns])
+                file.write("\n".join([form % tuple(row) for row in rows.tolist()]) + "\n")
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+_ROWS = 65536
+"""That are written together."""
+
+
+def _rows(link: LinkOfLoop, part: slice, names: list[str]) -> Floats:
+    """Rows of a trace's file, shape (n, names); delays of what was lost are NaN."""
+    found = []
+    for name in names:
+        values = np.asarray(getattr(link, name)[part], dtype=np.float64)
+        if name.endswith("_delay"):
+            values = np.where(getattr(link, name.replace("_delay", "_lost"))[part], np.nan, values)
+        found.append(values)
+    return np.stack(found, axis=1)

@@ -165,7 +165,8 @@ class Setting:
 Reading = Measurement | LossRates | Setting
 
 
-def needs_packets(count: int, source: str, what: str) -> None:
-    """Raises MeasurementError for a file without a single packet."""
+def needs_packets(count: int, source: str, what: str, malformed: Malformed | None = None) -> None:
+    """Raises MeasurementError for a file without a single packet, with the lines that were not understood."""
     if count < 1:
-        raise MeasurementError(f"{source}: has no {what}")
+        why = "; ".join(() if malformed is None else malformed.sentences())
+        raise MeasurementError(f"{source}: has no {what}" + (f": {why}" if why else ""))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from agv_analysis.link.channel_fit import Estimate
@@ -81,7 +82,7 @@ def _at_most(name: str, seen: Estimate, limit: float, link: LinkAvailability) ->
 
 
 def _at_least(seen: Estimate, limit: float) -> Answer:
-    said = f"mean time between failures {seen.value:.4g} s"
+    said = f"mean time between failures {seen.value:.4g} s" if math.isfinite(seen.value) else "no failure"
     said += f" ({seen.low:.4g} s to {seen.high:.4g} s)" if seen.low < seen.high else ""
     said += f", at least {limit:.4g} s"
     return (YES if seen.low >= limit else NO if seen.high < limit else CANNOT_TELL), said

@@ -143,7 +143,7 @@ def _read(path: Path, options: Options) -> Measurement:
     for block in blocks(path, options.progress):
         for role, values in rows.part(block).items():
             columns[role].extend(_as_flags(values) if role in _ALWAYS_FLAGS else values)
-    needs_packets(len(next(iter(columns.values()))), str(path), "row below its header")
+    needs_packets(len(next(iter(columns.values()))), str(path), "row below its header", rows.malformed)
     return _measurement(str(path), {role: column.values for role, column in columns.items()}, rows, options)
 
 
@@ -275,7 +275,7 @@ def _by_number(path: Path, rows: _Rows, options: Options) -> Measurement:
         found.mention(seq[~came])
         sent = part[instant][is_numbered][came] if instant else None
         found.add(seq[came], tuple(column[came] for column in given), sent)
-    needs_packets(found.records, str(path), "row with a number")
+    needs_packets(found.records, str(path), "row with a number", rows.malformed)
     notes = [
         *rows.notes, "a number without a row is taken for lost; packets before the first and after the last are unknown"
     ]  # fmt: skip

@@ -47,7 +47,7 @@ def _read(path: Path, options: Options) -> Measurement:
         table, again = _table(block, malformed)
         found.add(table[:, 0].astype(np.int64), tuple(table[:, i] for i in (1, 2, 3)))
         duplicates += again
-    needs_packets(found.records, str(path), "line of a reply")
+    needs_packets(found.records, str(path), "line of a reply", malformed)
     interval = options.interval or _USUAL_INTERVAL
     assumed = "as --interval says" if options.interval else "irtt's usual, is assumed; say otherwise with --interval"
     notes = (

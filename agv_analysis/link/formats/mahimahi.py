@@ -47,7 +47,7 @@ def _read(path: Path, options: Options) -> Measurement:
     for rows in parts_of_rows(path, 1, malformed, options.progress):
         found.extend(rows[:, 0])
     at = found.values
-    needs_packets(len(at), str(path), "line of an opportunity")
+    needs_packets(len(at), str(path), "line of an opportunity", malformed)
     if np.any(np.diff(at) < 0.0) or not at[-1] > 0.0:
         raise MeasurementError(f"{path}: times of a mahimahi trace must not decrease, and end behind 0")
     interval = options.interval or _USUAL_INTERVAL

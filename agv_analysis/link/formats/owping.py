@@ -43,7 +43,7 @@ def _read(path: Path, options: Options) -> Measurement:
             malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
         parts.append(np.stack([numbers.digits[good] for numbers in columns]))
     found = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0), dtype=np.uint64)
-    needs_packets(found.shape[1], str(path), "line of a packet")
+    needs_packets(found.shape[1], str(path), "line of a packet", malformed)
     return _measurement(str(path), found, malformed)
 
 

@@ -232,6 +232,13 @@ def test_rows_of_a_table_that_are_none_are_named(tmp_path: Path) -> None:
     assert (found.packets, found.span, found.malformed.count) == (2, 1.0, 2)
 
 
+def test_a_table_without_a_row_that_is_understood_says_why(tmp_path: Path) -> None:
+    with pytest.raises(
+        MeasurementError, match=r"has no row below its header: 1 line was not .* \(line 2: 'May  1, 2024"
+    ):
+        read(tmp_path / "a", "frame.time_epoch\ticmp.resptime\nMay  1, 2024 12:00:00 CEST\t7.0\n")
+
+
 def test_numbers_of_a_table_begin_anew_and_may_be_missing(tmp_path: Path) -> None:
     rows = [(n % 65536, 0.01 * n) for n in range(65530, 65545) if n not in (65533, 65537)]
     found = read(tmp_path / "a", "seq,time\n" + "".join(f"{n},{t:.2f}\n" for n, t in rows))
