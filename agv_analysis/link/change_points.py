@@ -37,6 +37,9 @@ _FEWEST = 12
 
 _OUTAGES = 3
 
+_TOGETHER = 1 << 17
+"""Slots whose transitions are counted together."""
+
 Counts = NDArray[np.int64]
 
 
@@ -86,8 +89,7 @@ def _most_likely_change(k: Steps, lost: Outcomes, segment: Segment) -> tuple[flo
     if length * _FEWEST > len(k):
         return None, segment.begin
     edges = np.linspace(0, len(k) - 1, min(len(k) // length + 1, len(k))).astype(np.int64)  # no block is empty
-    parts = [slice(first, last + 1) for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
-    blocks = np.stack([_transitions_before(k[part], lost[part])[:, -1].copy() for part in parts], axis=1)
+    blocks = _transitions_within(k, lost, edges, max(1, _TOGETHER // length))
     before = np.cumsum(blocks, axis=1)
     observed = _gains(before)
     rng = np.random.default_rng(1)
@@ -114,6 +116,16 @@ def _transitions_before(k: Steps, lost: Outcomes) -> Counts:
     before, after = lost[:-1], lost[1:]
     kinds = np.array([~before & after, ~before, before & ~after, before]) & known
     return np.concatenate((np.zeros((4, 1), dtype=np.int64), np.cumsum(kinds, axis=1)), axis=1)
+
+
+def _transitions_within(k: Steps, lost: Outcomes, edges: Steps, together: int) -> Counts:
+    """The same of each block, from an edge to the next, so many of them at once; shape (4, edges - 1)."""
+    found = []
+    for first in range(0, len(edges) - 1, together):
+        some = edges[first : first + together + 1]
+        part = slice(some[0], some[-1] + 1)
+        found.append(np.diff(_transitions_before(k[part], lost[part])[:, some - some[0]], axis=1))
+    return np.concatenate(found, axis=1)
 
 
 def _gains(before: Counts) -> Floats:
