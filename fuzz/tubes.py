@@ -71,7 +71,8 @@ class Search:
         covering = None if tube is None else with_remainder(self._loop, linear, tube)
         if covering is None:
             raise click.ClickException(f"{policy} on {track}: no tube for outages of {n} slots covers the second order")
-        self._tube: Tube = covering
+        self.tube: Tube = covering
+        """The one that covers what is of second order."""
         self._rng = rng
         self._best: Lengths = np.full(_SLOTS, n)
         self.case = Case(policy, track, n, covering.deviation)
@@ -105,7 +106,7 @@ class Search:
 
     def _used(self, outcomes: Outcomes) -> tuple[float, float, int]:
         """Largest share of a bound, largest distance [m], and how many of the runs were outside of the tube."""
-        every, tube = self._loop.steps // _PLACES, self._tube
+        every, tube = self._loop.steps // _PLACES, self.tube
         found, paths = self._loop.excursions(outcomes, every, kept=_SLOTS, follow=False)
         rows = (found.steps[:_PLACES, None] + np.arange(_SLOTS)) % len(tube.bounds)
         deviation = paths[:_PLACES] - tube.nominal[rows]
