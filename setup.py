@@ -36,7 +36,7 @@ setup(
         "jinja2>=3.0",
         "matplotlib>=3.6",
         "lz4>=4.0",
-        "mcap>=1.2",
+        "mcap>=1.6",
         "numba>=0.57",
         "numpy>=1.23",
         "plotly>=6.0",

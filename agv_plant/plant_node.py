@@ -29,7 +29,7 @@ from agv_ros.codec import decode_command, decode_slot, encode_clock, encode_pose
 from agv_ros.executor import run_node
 from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.messages import FRAME_AGV, Command, InvalidMessageError, StampedPose
-from agv_ros.node import LoopNode
+from agv_ros.node import STOPPED_BY, LoopNode
 from agv_ros.parts import complaint
 from agv_ros.pose import Pose
 from agv_ros.speeds_codec import decode_speeds
@@ -95,6 +95,12 @@ class PlantNode(LoopNode[PlantParameters]):
         if self._lockstep:
             self._watch_for_answers()
         self.poll(self._begin)
+
+    def on_stop(self, reason: str) -> None:
+        """A run that was to have a certain length has not come to its end."""
+        super().on_stop(reason)
+        if math.isfinite(self.steps):
+            self.failure = f"{self.get_name()} was {STOPPED_BY}{reason} at {progress_line(self.k, self.steps)}"
 
     @property
     def state(self) -> Pose:

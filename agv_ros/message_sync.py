@@ -42,7 +42,7 @@ class Joined(Generic[M]):
 
 
 MOST_WAITING = 1000
-"""Messages and slots that wait for each other at most, as many as the queue of a topic holds."""
+"""Messages and slots that wait for each other at most."""
 
 
 class MessageSync(Generic[M]):

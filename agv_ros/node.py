@@ -37,12 +37,19 @@ from agv_ros.stamps import LATEST_NS, Grid, to_nanoseconds
 
 P = TypeVar("P", bound=LoopParameters)
 
-# Deep enough that a reader which falls behind for a moment, the recorder above all, still gets every message.
+# Deep enough that a reader which falls behind for seconds, the recorder above all, still gets every message, even in
+# lockstep, where they are thousands a second. DDS sets memory aside only for messages that wait.
 # Only copies of it are used: rclpy writes a topic's overrides into the profile that it is given.
-LOOP_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+LOOP_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
 
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
+
+_ACK_PERIOD = 0.1
+"""For how long [s] at a time a node waits until its subscribers have acknowledged what it has sent."""
+
+STOPPED_BY = "stopped by "
+"""Begins the line that a node logs when it is asked to end before it has done its work."""
 
 ENDED = "ended"
 """Key in a node's last diagnostics: its counts of messages there are final."""
@@ -66,9 +73,9 @@ class Output:
         """Has the topic this many subscribers? One fewer is enough beside the loop: only a recorder listens there."""
         return bool(self._publisher.get_subscription_count() >= subscribers - self._side)
 
-    def flush(self, seconds: float) -> None:
-        """Wait until every subscriber has what was sent, `seconds` at most."""
-        self._publisher.wait_for_all_acked(Duration(nanoseconds=to_nanoseconds(seconds)))
+    def flush(self, seconds: float) -> bool:
+        """Wait until every subscriber has what was sent, `seconds` at most; do they have it?"""
+        return bool(self._publisher.wait_for_all_acked(Duration(nanoseconds=to_nanoseconds(seconds))))
 
 
 class LoopNode(Node, Generic[P]):
@@ -186,6 +193,10 @@ class LoopNode(Node, Generic[P]):
         # On the steady clock: where use_sim_time is set, ROS time stands still until the loop runs.
         timer = self.create_timer(_POLL_PERIOD, again, clock=self._steady)
 
+    def on_stop(self, reason: str) -> None:
+        """Called when the node is asked to end before it has done its work, by a signal as in "SIGTERM"."""
+        self.get_logger().info(f"{STOPPED_BY}{reason}")
+
     def is_settled(self) -> bool:
         """Has everything that is on its way to this node arrived? Polled for a moment when the node is stopped."""
         return True
@@ -195,11 +206,13 @@ class LoopNode(Node, Generic[P]):
         self._ended = True
         self.report(self._last_ns)
 
-    def flush(self, seconds: float) -> None:
+    def flush(self, seconds: float, is_hurried: Callable[[], bool] = lambda: False) -> None:
         """Wait until all that was published has arrived, `seconds` at most: a dead subscriber acknowledges nothing."""
         deadline = time.monotonic() + seconds
         for output in self.outputs:
-            output.flush(max(0.0, deadline - time.monotonic()))
+            while not output.flush(min(_ACK_PERIOD, max(0.0, deadline - time.monotonic()))):
+                if time.monotonic() >= deadline or is_hurried():
+                    return
 
     # -- what went wrong ---------------------------------------------------------------------------------------------
 

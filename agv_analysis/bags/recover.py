@@ -25,9 +25,9 @@ from agv_analysis.bags.message_batch import Batch, Layouts
 from agv_analysis.bags.message_compression import inflated_batches
 from agv_analysis.bags.records import DATA_END_SIZE, FOOTER_SIZE, MAGIC, QOS, RECORD, TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import METADATA, Contents, locate, open_files
+from agv_analysis.bags.rosbag2_metadata import TopicInfo, metadata_text, rosbag2_metadata
 from agv_analysis.bags.storage import Storage
 from agv_analysis.bags.topic_types import TopicTypes
-from agv_analysis.bags.writer import TopicInfo, metadata_text, rosbag2_metadata
 
 _PIECE = 2**20
 

@@ -21,6 +21,14 @@ PITCH = 20.0
 @click.command("run")
 @with_settings
 @click.option("--bag", type=click.Path(path_type=Path), help="Record to this directory, which must not exist.")
+@click.option("--fsync", is_flag=True, help="Have the disk write each chunk of the bag: for a loss of power.")
+@click.option(
+    "--if-unwritable",
+    type=click.Choice(["end", "continue"]),
+    default="end",
+    show_default=True,
+    help="When the bag cannot be written any more, as on a full disk.",
+)
 @click.option("--clock", type=click.Choice(["lockstep", "realtime"]), help="As --set plant.clock=...")
 @click.option("--processes", is_flag=True, help="One process for each node, of a fleet for each vehicle.")
 @click.option("--duration", type=float, help="As --set plant.duration=... [s]; cuts the run short.")
@@ -36,6 +44,8 @@ def command(
     params: str,
     settings: tuple[str, ...],
     bag: Path | None,
+    fsync: bool,
+    if_unwritable: str,
     clock: str | None,
     processes: bool,
     duration: float | None,
@@ -61,24 +71,28 @@ def command(
     given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
     scenario = load_scenario(params, (*settings, *given))
     if fleet is not None:
-        _run_fleet(scenario, fleet, pitch, bag, processes)
+        _run_fleet(scenario, fleet, pitch, bag, processes, (fsync, if_unwritable))
         return
     with needs_ros():
         from agv_analysis.runtime.processes import run_in_processes
+        from agv_analysis.runtime.run_setup import OnDisk
         from agv_analysis.runtime.runner import run_in_process
     from agv_analysis.commands.progress import step_bar
 
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
-        outcome = (run_in_processes if processes else run_in_process)(scenario, bag, progress)
+        run = run_in_processes if processes else run_in_process
+        outcome = run(scenario, bag, progress, on_disk=OnDisk(fsync, if_unwritable))
     click.echo(f"{outcome.steps} steps" + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
     if outcome.recording:
         click.echo(f"bag: {bag}: {outcome.recording}")
-    failures = [failure for failure in (outcome.failure, outcome.recording_failure) if failure]
+    failures = dict.fromkeys(failure for failure in (outcome.failure, outcome.recording_failure) if failure)
     if failures:
         raise click.ClickException("; ".join(failures))
 
 
-def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, processes: bool) -> None:
+def _run_fleet(
+    scenario: Scenario, count: int, pitch: float, bag: Path | None, processes: bool, disk: tuple[bool, str]
+) -> None:
     from agv_analysis.bags.writer import new_directory
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.runtime.fleet import to_json, vehicle_names, vehicle_scenarios
@@ -87,12 +101,13 @@ def _run_fleet(scenario: Scenario, count: int, pitch: float, bag: Path | None, p
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
     with needs_ros():
         from agv_analysis.runtime.processes import run_fleet_in_processes
+        from agv_analysis.runtime.run_setup import OnDisk
         from agv_analysis.runtime.runner import run_fleet
     if bag is not None:
         with new_directory(bag):
             pass  # each vehicle's recorder goes on in it
     with step_bar(count * scenario.plant.duration / scenario.plant.ts) as progress:
-        outcomes = (run_fleet_in_processes if processes else run_fleet)(fleet, bag, progress)
+        outcomes = (run_fleet_in_processes if processes else run_fleet)(fleet, bag, progress, OnDisk(*disk))
     ended = dict(zip(fleet, outcomes, strict=True))
     rate = sum(outcome.rate for outcome in outcomes)
     click.echo(

@@ -18,3 +18,10 @@ class RecorderParameters(TwoDomains):
         "log time of a message; stamp: its own, so that equal runs give equal files; receive: when it was received",
         choices=("stamp", "receive"),
     )
+    fsync: bool = parameter(False, "have the disk write each chunk, so that a loss of power costs no more than a kill")
+    if_unwritable: str = parameter(
+        "end",
+        "what happens once the disk is full or the bag is gone; end: the recorder ends, and with it the run; continue: "
+        "the loop goes on without being recorded",
+        choices=("end", "continue"),
+    )

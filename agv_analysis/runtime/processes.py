@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -19,13 +20,14 @@ from typing import Any
 import click
 
 from agv_analysis.runtime.outcome import Outcome
-from agv_analysis.runtime.run_setup import params_file, recording_of, scenario_that_waits
+from agv_analysis.runtime.run_setup import AS_USUAL, OnDisk, params_file, recording_of, scenario_that_waits
 from agv_analysis.runtime.runner import Progress, run_fleet
 from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.plant_node import progress_line, progress_of
 from agv_ros.errors import UserError
-from agv_ros.executor import Stop, stop_on_signals
+from agv_ros.executor import ENDS_WITH_STDIN, Stop, stop_on_signals
+from agv_ros.node import STOPPED_BY
 from agv_ros.parameters import as_dict
 
 _MODULES = {
@@ -39,6 +41,12 @@ _MODULES = {
 _STOP_TIMEOUT = 20.0
 """How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
 
+_SHORT_TIMEOUT = 0.8
+"""Likewise, where another process is gone or halted: it will not say any more what would be waited for."""
+
+_HURRY_TIMEOUT = 1.0
+"""How long [s] a process may take that was asked to stop for the second time."""
+
 _LOOK_PERIOD = 0.1
 """How often [s] the processes are looked at while they run."""
 
@@ -49,7 +57,7 @@ _LOG_PREFIX = re.compile(r"^\[[A-Z]+\] \[[0-9.]+\] \[[^]]*\]: ")
 """What rclpy's logging puts before a line: severity, time, node."""
 
 
-def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -> Outcome:
+def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress, on_disk: OnDisk = AS_USUAL) -> Outcome:
     """Run a scenario with one process for each node.
 
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
@@ -59,44 +67,67 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress) -
         nodes: dict[str, _Process] = {}
         try:
             if bag is not None:
-                recording = as_dict(recording_of(scenario, bag, params))
+                recording = as_dict(recording_of(scenario, bag, params, on_disk))
                 nodes["recorder"] = _Process("recorder", _node_command("recorder", params, recording))
             for name in reversed(SCHEMAS):
                 nodes[name] = _Process(name, _node_command(name, connected_params, {}), connected.domain_of(name))
             outcome = _watch(nodes, stop, progress)
             return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
         finally:
-            for node in nodes.values():
-                node.stop(signal.SIGTERM)
+            _end(nodes, stop, _STOP_TIMEOUT)
 
 
 def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcome:
     """Wait for the plant to end, then stop the others, the recorder last."""
-    plant = nodes["plant"]
-    while plant.is_running(_LOOK_PERIOD) and all(node.is_running() for node in nodes.values()) and not stop.requested:
+    plant, recorder = nodes["plant"], nodes.get("recorder")
+    while plant.is_running(_LOOK_PERIOD) and not (stop.requested or any(map(_Process.is_ending, nodes.values()))):
         progress(plant.steps)
-    ended = [node for node in nodes.values() if node is not plant and not node.is_running()]
-    recorder = nodes.pop("recorder", None)
-    for node in nodes.values():
-        node.send_signal(signal.SIGINT)
-    for node in nodes.values():
-        node.collect()
-    if recorder is not None:
-        recorder.stop(signal.SIGINT)
-        nodes["recorder"] = recorder
+    ended = [node for node in nodes.values() if node.is_ending()]
+    halted = [node for node in nodes.values() if node.is_halted()]
+    is_cut_off = halted or any(node.killed_by for node in ended)
+    _end(nodes, stop, _SHORT_TIMEOUT if is_cut_off else _STOP_TIMEOUT)
     progress(plant.steps)
-    if stop.requested:
-        failure = f"interrupted after step {plant.steps}"
-    elif ended:
-        failure = f"{ended[0].name} ended: {ended[0].last_line()}"
-    else:
-        failure = plant.last_line() if plant.status else ""
     recording = recorder.last_line() if recorder else ""
     failed = recorder is not None and recorder.status != 0
+    # With status 0 the plant has done all of its steps: what ended before it was not missed.
+    failure = "" if plant.status == 0 else _failure(plant, ended, halted, stop)
     return Outcome(plant.steps, plant.pace.rate, failure, "" if failed else recording, recording if failed else "")
 
 
-def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress) -> list[Outcome]:
+def _failure(plant: _Process, ended: Sequence[_Process], halted: Sequence[_Process], stop: Stop) -> str:
+    """Why a run has ended before all of its steps were done."""
+    if stop.requested:
+        return f"interrupted after step {plant.steps}, by {stop.reason}"
+    if killed := [node.last_line() for node in ended if node.killed_by]:
+        return f"{'; '.join(killed)}, after step {plant.steps}"
+    if stopped := [f"{node.name} was {node.stopped}" for node in ended if node.stopped]:
+        return f"{'; '.join(stopped)}, after step {plant.steps}"
+    said = [node.last_line() if node is plant else f"{node.name} ended: {node.last_line()}" for node in ended]
+    return "; ".join([*said, *(f"{node.name} is halted by a signal" for node in halted)])
+
+
+def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float) -> None:
+    """End all nodes, the recorder, which has to hear of the others' end, last."""
+    _end_all([node for name, node in nodes.items() if name != "recorder"], stop, patience)
+    _end_all([node for name, node in nodes.items() if name == "recorder"], stop, patience)
+
+
+def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None:
+    """Ask processes to end; after `patience` [s], or as soon as it is insisted on, to hurry; then kill them."""
+    for timeout in (patience, _HURRY_TIMEOUT):
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + timeout
+        while any(process.is_running(_LOOK_PERIOD / 10) for process in processes) and time.monotonic() < deadline:
+            if stop.insisted and timeout == patience:
+                break
+    for process in processes:
+        process.collect()
+
+
+def run_fleet_in_processes(
+    fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress, on_disk: OnDisk = AS_USUAL
+) -> list[Outcome]:
     """As `run_fleet`, with one process for each vehicle: its nodes have one, as they cost most where they are apart."""
     for scenario in fleet.values():  # what cannot be used is to be said once
         scenario_that_waits(scenario, recorded=bag is not None)
@@ -106,15 +137,13 @@ def run_fleet_in_processes(fleet: Mapping[str, Scenario], bag: Path | None, prog
             for name, scenario in fleet.items():
                 params = files.enter_context(params_file(scenario))
                 command = [sys.executable, "-m", "agv_analysis.runtime.processes", name, str(params), str(bag or "")]
+                command.append(json.dumps(on_disk))
                 vehicles.append(_Process(name, command))
             for vehicle in vehicles:
                 while vehicle.is_running(_LOOK_PERIOD) and not stop.requested:
                     progress(sum(other.steps for other in vehicles))
         finally:
-            for vehicle in vehicles:
-                vehicle.send_signal(signal.SIGINT)
-            for vehicle in vehicles:
-                vehicle.collect()
+            _end_all(vehicles, stop, _STOP_TIMEOUT)
         outcomes = [_outcome_of(vehicle, stop.requested) for vehicle in vehicles]
         progress(sum(outcome.steps for outcome in outcomes))
         return outcomes
@@ -129,7 +158,7 @@ def _outcome_of(vehicle: _Process, stopped: bool) -> Outcome:
         return Outcome(vehicle.steps, vehicle.pace.rate, failure, "", "")
 
 
-def _drive_vehicle(name: str, params: str, bag: str) -> None:
+def _drive_vehicle(name: str, params: str, bag: str, on_disk: str) -> None:
     """Body of a vehicle's process: its progress goes to standard output and, as the last line, its Outcome."""
     scenario = load_scenario(params)
     steps, last_report = scenario.plant.duration / scenario.plant.ts, time.monotonic()
@@ -140,7 +169,7 @@ def _drive_vehicle(name: str, params: str, bag: str) -> None:
             last_report = time.monotonic()
             click.echo(progress_line(k, steps))
 
-    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, report)
+    (outcome,) = run_fleet({name: scenario}, Path(bag) if bag else None, report, OnDisk(*json.loads(on_disk)))
     click.echo(json.dumps(dataclasses.asdict(outcome)))
 
 
@@ -159,12 +188,15 @@ class _Process:
         self.name = name
         self.steps = 0
         self.pace = Speedometer()
+        self.stopped = ""
+        """What it said when it was asked to end before it had done its work."""
         self._lines: list[str] = []
         domain = {"ROS_DOMAIN_ID": str(domain_id)} if domain_id >= 0 else {}
-        # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order.
+        # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order. However the runner
+        # itself ends, the system closes its end of the pipe, and so they end, too.
         self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **domain},
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            start_new_session=True, env={**os.environ, "PYTHONUNBUFFERED": "1", ENDS_WITH_STDIN: "1", **domain},
         )  # fmt: skip
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -174,11 +206,13 @@ class _Process:
         for line in self._process.stdout:
             text = _LOG_PREFIX.sub("", line.strip())
             steps = progress_of(text)
-            if steps is None:
-                self._lines.append(text)
-            else:
+            if steps is not None:
                 self.steps = steps
                 self.pace.see(steps)
+            if text.startswith(STOPPED_BY):
+                self.stopped = text
+            if steps is None or not text.startswith("step "):  # else it says no more than that
+                self._lines.append(text)
 
     @property
     def status(self) -> int | None:
@@ -193,26 +227,44 @@ class _Process:
             return True
         return False
 
+    def is_ending(self) -> bool:
+        """Has it ended, or has it been asked to?"""
+        return bool(self.stopped) or not self.is_running()
+
+    def is_halted(self) -> bool:
+        """Has a signal, as SIGSTOP, halted it?"""
+        if self._process.returncode is not None:
+            return False
+        with contextlib.suppress(ChildProcessError):
+            return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+        return False
+
+    @property
+    def killed_by(self) -> str:
+        """The signal that ended it, empty if none did."""
+        number = -(self.status or 0)
+        names = {one.value: one.name for one in signal.Signals}
+        return names.get(number, f"signal {number}") if number > 0 else ""
+
     def last_line(self) -> str:
-        """The last line that it printed."""
+        """The last line that it printed; if a signal ended it, which."""
+        if self.killed_by:
+            return f"{self.name} was ended by {self.killed_by}"
         return self._lines[-1] if self._lines else f"exit status {self.status}, without any output"
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send it a signal, unless it has ended."""
+        """Send it a signal, unless it has ended; one that is halted goes on for it."""
         if self.is_running():
             self._process.send_signal(number)
-
-    def stop(self, number: signal.Signals) -> None:
-        """Signal it to end, and wait for that."""
-        self.send_signal(number)
-        self.collect()
+            self._process.send_signal(signal.SIGCONT)
 
     def collect(self) -> None:
-        """Wait for its end, kill it if that takes too long, and read the rest of its output."""
-        if self.is_running(_STOP_TIMEOUT):
-            self._process.kill()
+        """Kill it if it still runs, and read the rest of its output."""
+        self._process.kill()
         self._process.wait()
         self._reader.join()
+        assert self._process.stdin is not None
+        self._process.stdin.close()
 
 
 if __name__ == "__main__":

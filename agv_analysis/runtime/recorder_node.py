@@ -21,7 +21,8 @@ from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
 
 from agv_analysis.bags.message_definitions import schema_of
-from agv_analysis.bags.writer import NODES_NAME, RESTART, BagWriter, TopicInfo
+from agv_analysis.bags.rosbag2_metadata import TopicInfo
+from agv_analysis.bags.writer import NODES_NAME, RESTART, BagWriter
 from agv_analysis.runtime.parameter_client_node import ParameterClient
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario
@@ -52,6 +53,9 @@ TOPICS: dict[str, type] = {
     "/parameter_events": ParameterEvent,
 }
 """What is recorded. The loop's names are relative: a recorder records the loop of its own namespace."""
+
+_FLUSH_PERIOD = 0.08
+"""How often [s] messages of a loop in real time are written: a recorder that is killed takes two of them along."""
 
 _DIAGNOSTICS = list(TOPICS).index("/diagnostics")
 """Its number; a fleet's recorders know it under other names."""
@@ -89,14 +93,20 @@ class RecorderNode(LoopNode[RecorderParameters]):
             self._describer(topic, kind, where)
             for topic, kind, where in zip(self._names, TOPICS.values(), sides, strict=True)
         ]
-        self._writer = BagWriter(Path(settings.bag), describe, self.about(), by_stamp=settings.log_time == "stamp")
+        self._by_stamp = settings.log_time == "stamp"
+        self._writer = BagWriter(Path(settings.bag), describe, self.about(), self._by_stamp, settings.fsync)
+        self._broken = ""
+        """Why the bag cannot be written any more."""
+        self._unwritten = 0
+        """Messages that came after that."""
         self._now_ns: Callable[[int], int] = (
-            (lambda stamp_ns: stamp_ns) if settings.log_time == "stamp" else (lambda _: time.time_ns())
+            (lambda stamp_ns: stamp_ns) if self._by_stamp else (lambda _: time.time_ns())
         )
         for number, (topic, kind) in enumerate(TOPICS.items()):
             for side in sides[number]:
                 self.input(kind, topic, self._receiver(number), on=side)
         self.poll(self._ask)
+        self.create_timer(_FLUSH_PERIOD, self._flush, clock=self._steady)
 
     def asked(self) -> dict[str, str]:
         """Nodes whose parameters are asked for, each with a topic that it publishes."""
@@ -107,7 +117,7 @@ class RecorderNode(LoopNode[RecorderParameters]):
         return _about(self.settings.params_file)
 
     def _receiver(self, number: int) -> Callable[[bytes], None]:
-        write, now_ns = self._writer.write, self._now_ns
+        write, now_ns = self._write, self._now_ns
 
         def record(data: bytes) -> None:
             stamp_ns = self._newest_ns = max(0, stamp_of(data))  # MCAP knows no time before 0
@@ -123,6 +133,39 @@ class RecorderNode(LoopNode[RecorderParameters]):
                 write(number, data, now_ns(self._newest_ns), self._newest_ns)
 
         return {_DIAGNOSTICS: record_diagnostics, _PARAMETER_EVENTS: record_change}.get(number, record)
+
+    def _write(self, number: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        if self._broken:
+            self._unwritten += 1
+            return
+        try:
+            self._writer.write(number, data, log_time_ns, publish_time_ns)
+        except OSError as error:
+            self._give_up(error)
+
+    def _flush(self) -> None:
+        """Write what has come, if time matters; where a loop is in lockstep, the number of messages does."""
+        if self._broken or (self._by_stamp and not self._is_realtime()):
+            return
+        try:
+            self._writer.write_older()
+        except OSError as error:
+            self._give_up(error)
+
+    def _is_realtime(self) -> bool:
+        plant = self._parameters_of.get("plant")
+        return plant is not None and (plant.values or {}).get("clock") == "realtime"
+
+    def _give_up(self, error: OSError) -> None:
+        """The bag cannot be written any more: end, or only count from now on."""
+        self._broken = (
+            f"{self.settings.bag}: cannot be written any more: {error.strerror}; what is in it by then can be read"
+        )
+        self._writer.abandon()
+        if self.settings.if_unwritable == "end":
+            self.fail(self._broken)
+        else:
+            self.get_logger().warning(f"{self._broken}; the loop goes on without being recorded")
 
     def _describer(self, topic: str, kind: type, sides: Sequence[Node]) -> Callable[[], TopicInfo]:
         module = kind.__module__.split(".")
@@ -210,22 +253,26 @@ class RecorderNode(LoopNode[RecorderParameters]):
 
     def is_settled(self) -> bool:
         """Is everything here that was published? Only nodes that have ended have said all that they published."""
-        return not self._running and not self.missing()
+        return not self._running and (bool(self._broken) or not self.missing())
 
     def has_all_of(self, nodes: int) -> bool:
         """Is everything here, after this number of nodes has ended? Before, messages may still be on their way."""
-        is_said = not any(client.is_waiting for client in self._parameters_of.values())
+        is_said = bool(self._broken) or not any(client.is_waiting for client in self._parameters_of.values())
         return len(self._published) >= nodes and self.is_settled() and is_said
 
     def close(self) -> None:
         """Finish the bag and say what is in it."""
+        if self._broken:
+            self.failure = self._broken + f"; {self._unwritten} messages came later" * (self._unwritten > 0)
+            return
         missing = self.missing()
         try:
             if any(client.values is not None for client in self._parameters_of.values()):
                 self._writer.add_metadata(NODES_NAME, self._said())
             self._writer.close()
         except OSError as error:
-            self.failure = f"{self.settings.bag}: cannot be written: {error.strerror}"
+            self._give_up(error)
+            self.failure = self._broken
             return
         self.summary = f"{sum(self._writer.counts)} messages"
         if missing:

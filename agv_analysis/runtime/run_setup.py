@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import SCHEMAS, Scenario
@@ -41,12 +42,23 @@ def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
     return Scenario(**nodes)
 
 
-def recording_of(scenario: Scenario, bag: Path, params: Path) -> RecorderParameters:
+class OnDisk(NamedTuple):
+    """What a recorder does with the disk."""
+
+    fsync: bool = RecorderParameters.fsync
+    if_unwritable: str = RecorderParameters.if_unwritable
+
+
+AS_USUAL = OnDisk()
+
+
+def recording_of(scenario: Scenario, bag: Path, params: Path, on_disk: OnDisk) -> RecorderParameters:
     """What the recorder of a scenario is to do; `params` is the file of its parameters."""
     log_time = "stamp" if scenario.plant.clock == "lockstep" else "receive"
     return RecorderParameters(
         bag=str(bag), params_file=str(params), log_time=log_time, stop_timeout=PATIENCE,
         plant_domain_id=scenario.relay.plant_domain_id, edge_domain_id=scenario.relay.edge_domain_id,
+        fsync=on_disk.fsync, if_unwritable=on_disk.if_unwritable,
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from agv_analysis.runtime.one_process import OneProcess
 from agv_analysis.runtime.outcome import Outcome
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.runtime.replay_node import Pace, ReplayNode, ReplayRecorder
-from agv_analysis.runtime.run_setup import PATIENCE, params_file, recording_of, scenario_that_waits
+from agv_analysis.runtime.run_setup import AS_USUAL, PATIENCE, OnDisk, params_file, recording_of, scenario_that_waits
 from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_cloud.controller_node import ControllerNode
@@ -43,29 +43,36 @@ Progress = Callable[[int], None]
 """Called with the number of steps done, every now and then."""
 
 
-def run_in_process(scenario: Scenario, bag: Path | None, progress: Progress, executor: str = "events") -> Outcome:
+def run_in_process(
+    scenario: Scenario, bag: Path | None, progress: Progress, executor: str = "events", on_disk: OnDisk = AS_USUAL
+) -> Outcome:
     """Run a scenario with all nodes in this process.
 
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
     with stop_on_signals() as stop, OneProcess() as process:
-        loop = loop_of(process, scenario, bag)
+        loop = loop_of(process, scenario, bag, on_disk=on_disk)
         return run_loops(EXECUTORS[executor](context=process.context), [loop], stop, progress)[0]
 
 
-def run_fleet(fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress) -> list[Outcome]:
+def run_fleet(
+    fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress, on_disk: OnDisk = AS_USUAL
+) -> list[Outcome]:
     """Run scenarios beside each other in this process, each in the namespace that is its name and with its own bag.
 
     A vehicle that fails does not end the others. Raises UserError as `run_in_process` does.
     """
     with stop_on_signals() as stop, OneProcess() as process:
         loops = [
-            loop_of(process, scenario, None if bag is None else bag / name, name) for name, scenario in fleet.items()
+            loop_of(process, scenario, None if bag is None else bag / name, name, on_disk)
+            for name, scenario in fleet.items()
         ]
         return run_loops(EXECUTORS["events"](context=process.context), loops, stop, progress)
 
 
-def loop_of(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: str = "") -> Loop:
+def loop_of(
+    process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: str = "", on_disk: OnDisk = AS_USUAL
+) -> Loop:
     """The nodes of a scenario, in a namespace if they are a vehicle of a fleet."""
     connected = scenario_that_waits(scenario, recorded=bag is not None)
     if vehicle:  # what nodes have to say beside warnings is in the fleet's table
@@ -79,7 +86,9 @@ def loop_of(process: OneProcess, scenario: Scenario, bag: Path | None, vehicle: 
     ]
     with params_file(scenario) as params:
         recorder = (
-            None if bag is None else process.add_recorder(recording_of(scenario, bag, params), RecorderNode, vehicle)
+            None
+            if bag is None
+            else process.add_recorder(recording_of(scenario, bag, params, on_disk), RecorderNode, vehicle)
         )
     return Loop(plant, [plant, *others], recorder)
 
@@ -107,7 +116,7 @@ def replay_in_process(
         if bag is not None:
             own = [node.get_fully_qualified_name().lstrip("/") for node in nodes]
             make = partial(ReplayRecorder, inputs.source, own)
-            player.recorder = process.add_recorder(recording_of(scenario, bag, params), make)
+            player.recorder = process.add_recorder(recording_of(scenario, bag, params, AS_USUAL), make)
             player.recorder.player = player
         executor = EXECUTORS["events"](context=process.context)
         outcome = run_loops(executor, [Loop(player, nodes, player.recorder)], stop, progress)[0]
@@ -125,16 +134,17 @@ class Loop(NamedTuple):
 
     def is_over(self) -> bool:
         """Has the plant done its steps, or can a node not go on? Asked after each event."""
-        for node in self.nodes:  # noqa: SIM110  # a generator takes four times as long
+        for node in self.nodes:  # a generator takes four times as long
             if node.finished:
                 return True
-        return False
+        return self.recorder is not None and self.recorder.finished
 
     def outcome(self, rate: float, stopped: bool) -> Outcome:
         """How it ended."""
         plant, recorder = self.plant, self.recorder
         failure = plant.failure or next((node.failure for node in self.nodes if node.failure), "")
-        failure = failure or (f"interrupted at step {plant.k}" if stopped and not plant.finished else "")
+        if not (failure or plant.finished):
+            failure = f"interrupted at step {plant.k}" if stopped else f"ended by the recorder at step {plant.k}"
         recorded = (recorder.summary, recorder.failure) if recorder else ("", "")
         return Outcome(plant.k, rate, failure, *recorded)
 
@@ -154,9 +164,13 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
         for node in nodes:
             node.close()
         recorders = [(loop.recorder, len(loop.nodes)) for loop in loops if loop.recorder]
-        spin_for(executor, lambda: all(recorder.has_all_of(number) for recorder, number in recorders), PATIENCE)
+        spin_for(
+            executor,
+            lambda: stop.insisted or all(recorder.has_all_of(number) for recorder, number in recorders),
+            PATIENCE,
+        )
         for node in nodes:  # others may listen, too
-            node.flush(max(0.0, deadline - time.monotonic()))
+            node.flush(max(0.0, deadline - time.monotonic()), lambda: stop.insisted)
         for recorder, _ in recorders:
             recorder.close()
         executor.shutdown()

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from agv_analysis.bags.writer import REPLAY_OF, BagWriter, TopicInfo
+from agv_analysis.bags.rosbag2_metadata import TopicInfo
+from agv_analysis.bags.writer import REPLAY_OF, BagWriter
 from agv_analysis.recordings.loop_timing import is_more_than_jitter
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.panels import age as age_panel

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import random
+import resource
+import shutil
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +24,10 @@ rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 
+from agv_analysis.bags.bag import read_bag
 from agv_analysis.bags.message_definitions import schema_of
-from agv_analysis.bags.writer import BagWriter, TopicInfo
+from agv_analysis.bags.rosbag2_metadata import TopicInfo
+from agv_analysis.bags.writer import BagWriter
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.scenario import load_scenario, parse_scenario
@@ -200,14 +205,94 @@ def test_a_type_that_is_not_installed_is_named() -> None:
         schema_of("no_such_msgs/msg/Thing")
 
 
-def test_a_message_that_comes_late_is_put_in_its_place(tmp_path: Path) -> None:
+POSE = TopicInfo("/topic", "geometry_msgs/msg/PoseStamped", schema_of("geometry_msgs/msg/PoseStamped"), "", [])
+
+
+@pytest.fixture
+def writer(tmp_path: Path, request: pytest.FixtureRequest) -> BagWriter:
+    return BagWriter(tmp_path / "bag", [lambda: POSE], {}, by_stamp=getattr(request, "param", True))
+
+
+def random_bytes(count: int) -> Iterator[tuple[int, bytes]]:
+    """Stamps [ns], and payloads that cannot be compressed."""
+    generator = random.Random(1)
+    for ns in range(1, count + 1):
+        yield ns, generator.randbytes(120)
+
+
+def write_all(writer: BagWriter, messages: Iterable[tuple[int, bytes]]) -> None:
+    for ns, data in messages:
+        writer.write(0, data, ns, ns)
+
+
+def test_a_message_that_comes_late_is_put_in_its_place(tmp_path: Path, writer: BagWriter) -> None:
     """DDS may take seconds to bring one again; a loop in lockstep has gone on for thousands of steps by then."""
-    topic = TopicInfo("/topic", "geometry_msgs/msg/PoseStamped", schema_of("geometry_msgs/msg/PoseStamped"), "", [])
-    writer = BagWriter(tmp_path / "bag", [lambda: topic], {}, by_stamp=True)
-    sent = [*range(90_000), 50_000, *range(90_000, 100_000)]
+    sent = [*range(30_000), 10_000, *range(30_000, 40_000)]
     for ns in sent:
         writer.write(0, b"\0", ns, ns)
     writer.close()
+    again = BagWriter(tmp_path / "again/bag", [lambda: POSE], {}, by_stamp=True)
+    for ns in sorted(sent):
+        again.write(0, b"\0", ns, ns)
+    again.close()
     with next((tmp_path / "bag").glob("*.mcap")).open("rb") as file:
         times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
     assert [pair for pair in zip(times, sorted(sent), strict=True) if pair[0] != pair[1]] == []
+    assert (tmp_path / "bag/bag_0.mcap").read_bytes() == (tmp_path / "again/bag/bag_0.mcap").read_bytes()
+    assert sorted(file.name for file in (tmp_path / "bag").iterdir()) == ["bag_0.mcap", "metadata.yaml"]
+
+
+def test_a_copy_made_at_any_moment_lacks_few_messages(tmp_path: Path, writer: BagWriter) -> None:
+    """As after a kill, or a loss of power: at most 4096 messages of a loop in lockstep, and a chunk of 256 KiB."""
+    (tmp_path / "copy").mkdir()
+    for ns, data in random_bytes(20_000):
+        writer.write(0, data, ns, ns)
+        if ns % 3333 == 0:
+            shutil.copy(tmp_path / "bag/bag_0.mcap", tmp_path / "copy")
+            found = read_bag(tmp_path / "copy", topics=()).topics
+            count = found["/topic"].count if found else 0
+            assert ns - count <= 4096 + 2**18 / 150
+    writer.close()
+
+
+@pytest.mark.parametrize("writer", [True, False], indirect=True)
+def test_in_real_time_a_copy_has_what_was_there_at_the_last_write_but_one(tmp_path: Path, writer: BagWriter) -> None:
+    (tmp_path / "copy").mkdir()
+    for ns, data in random_bytes(1000):
+        writer.write(0, data, ns, ns)
+        if ns % 100 == 0:
+            writer.write_older()
+            shutil.copy(tmp_path / "bag/bag_0.mcap", tmp_path / "copy")
+            found = read_bag(tmp_path / "copy", topics=()).topics
+            assert (found["/topic"].count if found else 0) >= ns - 100
+    writer.close()
+
+
+def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path, writer: BagWriter) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            write_all(writer, random_bytes(100_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    writer.abandon()
+    found = read_bag(tmp_path / "bag", topics=())
+    assert found.topics["/topic"].count > 3000
+    assert [problem for problem in found.problems if "damaged" in problem] == []
+
+
+@pytest.mark.parametrize(("choice", "steps"), [("end", False), ("continue", True)])
+def test_a_bag_that_is_removed_is_said_and_the_loop_does_as_it_was_told(
+    start: Start, tmp_path: Path, choice: str, steps: bool
+) -> None:
+    where = tmp_path / "bag"
+    command = ("run", "config/outages.yaml", "--bag", str(where), "--if-unwritable", choice, "--clock", "realtime")
+    run = start("agv_analysis.cli", *command, "--duration", "3.0")
+    run.until(lambda: any(file.stat().st_size > 5000 for file in where.glob("*.mcap")))
+    shutil.rmtree(where)
+    status, said = run.end()
+    assert status == 1
+    assert f"{where}: cannot be written any more: the file was removed" in " ".join(said.split())
+    assert (f"{600 if steps else 0} steps" in said) == steps
+    assert "Traceback" not in said

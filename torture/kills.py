@@ -1,0 +1,176 @@
+"""Signals to the processes of a run: does it end as it should, with a reason, without orphans, with a readable bag?"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from agv_analysis.recordings.recording import read_run
+from agv_ros.errors import UserError
+
+NODES = ("runner", "recorder", "controller", "error_detector", "relay", "plant")
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGSTOP)
+CLOCKS = ("lockstep", "realtime")
+MOMENTS = ("start", "running", "end")
+
+IN_TIME = 5.0
+"""How long [s] a run may take to end after the signal, on a machine that is not busy."""
+
+MOST_LOST = {"lockstep": 1000, "realtime": 40 + 20}
+"""Steps that may be lost with a recorder that is killed: in real time 0.2 s, and what was on its way to it."""
+
+HALT = 2.0
+"""How long [s] SIGSTOP halts a process."""
+
+_STEPS = {"lockstep": 6000, "realtime": 800}
+_TS = 0.005
+_BYTES_A_STEP = 100
+"""Fewest that a step adds to the recording."""
+
+_PATIENCE = 90.0
+"""How long [s] anything may take before it counts as hanging."""
+
+
+class Case(NamedTuple):
+    """A signal to a process at a moment."""
+
+    node: str
+    number: signal.Signals
+    clock: str
+    moment: str
+
+    def __str__(self) -> str:
+        return f"{self.number.name} to the {self.node}, {self.clock}, {self.moment}"
+
+
+class Ended(NamedTuple):
+    """How a run ended."""
+
+    status: int
+    said: str
+    seconds: float
+    """From the signal to the end."""
+    orphans: tuple[str, ...]
+    """Processes of the run that outlived it."""
+
+
+def cases() -> Iterator[Case]:
+    """All combinations."""
+    for clock, moment, node, number in itertools.product(CLOCKS, MOMENTS, NODES, SIGNALS):
+        yield Case(node, number, clock, moment)
+
+
+def run(case: Case, folder: Path, params: str) -> Ended:
+    """Start a run of the params file in processes, recorded to `folder`/bag, send the signal, and wait for its end."""
+    steps = _STEPS[case.clock]
+    command = [sys.executable, "-m", "agv_analysis.cli", "run", params, "--processes", "--clock", case.clock]
+    command += ["--duration", str(steps * _TS), "--bag", str(folder / "bag")]
+    runner = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    family = {}
+    try:
+        _until(runner, lambda: len(_children(runner.pid)) == len(NODES) - 1)
+        family = _children(runner.pid)
+        share = {"start": None, "running": 0.3, "end": 0.9}[case.moment]
+        if share is not None:
+            _until(runner, lambda: _recorded(folder / "bag") > share * steps * _BYTES_A_STEP)
+        victim = runner.pid if case.node == "runner" else family[case.node]
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(victim, case.number)
+            if case.number == signal.SIGSTOP:
+                time.sleep(HALT)
+                os.kill(victim, signal.SIGCONT)
+        begun = time.monotonic()
+        said, _ = runner.communicate(timeout=_PATIENCE)
+        _until(None, lambda: not any(map(_runs, family.values())), 4.0)
+        seconds = time.monotonic() - begun
+        return Ended(runner.returncode, said, seconds, tuple(n for n, pid in family.items() if _runs(pid)))
+    finally:
+        for pid in [runner.pid, *family.values()]:
+            with contextlib.suppress(ProcessLookupError):
+                if pid == runner.pid and runner.poll() is not None:
+                    continue
+                os.kill(pid, signal.SIGKILL)
+        runner.wait()
+
+
+def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
+    """What is not as it should be, in words; empty if all is."""
+    found = [f"{node} outlived the run" for node in ended.orphans]
+    if ended.seconds > IN_TIME and case.number != signal.SIGSTOP:
+        found.append(f"ended after {ended.seconds:.1f} s")
+    if "Traceback" in ended.said:
+        found.append("said a traceback")
+    found += _wrong_status(case, ended)
+    recorded, missing = _in_bag(bag)
+    if recorded is None and case.moment != "start":
+        found.append("left a bag that cannot be read")
+    reached = re.search(r"after step (\d+)", ended.said)
+    if reached and recorded is not None and recorded < int(reached[1]) - MOST_LOST[case.clock]:
+        found.append(f"left {recorded} of {reached[1]} steps in the bag")
+    if case.clock == "lockstep" and case.number != signal.SIGKILL and missing:
+        found.append(f"lost {missing}")
+    return found
+
+
+def _wrong_status(case: Case, ended: Ended) -> list[str]:
+    """Is the exit status such as the signal asks for, and is the process named that it went to?"""
+    is_complete = f"{_STEPS[case.clock]} steps" in ended.said and "Error" not in ended.said
+    if case.node == "runner" and case.number == signal.SIGKILL:
+        return [] if ended.status == -signal.SIGKILL or is_complete else [f"exit status {ended.status}"]
+    if ended.status == 0:
+        return [] if is_complete else ["exit status 0 of a run that is not complete"]
+    if case.number == signal.SIGSTOP:
+        return [f"exit status {ended.status} after {HALT:g} s of halt"]
+    return [] if case.node == "runner" or case.node in ended.said else [f"does not name the {case.node}"]
+
+
+def _in_bag(bag: Path) -> tuple[int | None, dict[str, int]]:
+    """Steps in a recording, and messages that are missing from it."""
+    try:
+        found = read_run(bag)
+    except UserError:
+        return None, {}
+    return int(found.k[-1]) + 1, dict(found.unexplained)
+
+
+def _until(process: subprocess.Popen[str] | None, condition: Callable[[], bool], seconds: float = _PATIENCE) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline and (process is None or process.poll() is None):
+        time.sleep(0.01)
+
+
+def _children(pid: int) -> dict[str, int]:
+    """Processes of a run by the name of their node, as Linux' /proc tells."""
+    found: dict[str, int] = {}
+    for begun in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):
+            for child in begun.read_text().split():
+                words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
+                module = next((word.decode() for word in words if word.endswith(b"_node")), "")
+                if module:
+                    found[module.rpartition(".")[2].removesuffix("_node")] = int(child)
+    return found
+
+
+def _runs(pid: int) -> bool:
+    """Does a process still run? One that only waits to be collected does not."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def _recorded(bag: Path) -> int:
+    with contextlib.suppress(OSError):
+        return sum(file.stat().st_size for file in bag.glob("*.mcap"))
+    return 0
