@@ -31,11 +31,12 @@ class _Group(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         from agv_ros.errors import UserError
+        from agv_ros.printable import printable
 
         try:
             return super().invoke(ctx)
         except UserError as error:
-            raise click.ClickException(str(error)) from None
+            raise click.ClickException(printable(str(error))) from None
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})

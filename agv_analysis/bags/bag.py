@@ -12,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.bag_errors import BagError, UndecodableError
+from agv_analysis.bags.bag_errors import BagError, PaddingError, UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.json_table import JsonTable
 from agv_analysis.bags.known_types import UNDEFINED, Definition, KnownTypes, is_undefined
-from agv_analysis.bags.layout import LOG_TIME
+from agv_analysis.bags.layout import LEAD, LOG_TIME
 from agv_analysis.bags.message_batch import Batch
 from agv_analysis.bags.message_compression import inflated_batches
-from agv_analysis.bags.message_table import Table
+from agv_analysis.bags.message_table import Table, longest_in_proportion
 from agv_analysis.bags.records import QOS, TYPE_HASH, Channel, Schema
 from agv_analysis.bags.rosbag2 import Contents, locate, open_files
 from agv_analysis.bags.schema import short_name
@@ -143,10 +143,29 @@ def read_bag(
     nothing can be read.
     """
     path = Path(path)
+    known = KnownTypes(None if definitions is None else Path(definitions))
+    bag, padded = _read(path, topics, progress, known, {})
+    longest = {topic: size for topic in padded if (size := _longest_kept(path, topic)) is not None}
+    return _read(path, topics, progress, known, longest)[0] if longest else bag
+
+
+def _longest_kept(path: Path, topic: str) -> int | None:
+    """Bytes of the longest messages of a topic that are kept, if a few longer ones keep all from being an array."""
+    sizes: Counter[int] = Counter()
+    for storage in open_files(locate(path)):
+        for _, batch in inflated_batches(storage, lambda channel: channel.topic == topic, Findings()):
+            sizes.update(batch.sizes.tolist())
+    return longest_in_proportion(sizes)
+
+
+def _read(
+    path: Path, topics: Collection[str] | None, progress: Progress | None, known: KnownTypes, longest: dict[str, int]
+) -> tuple[Bag, list[str]]:
+    """A bag, and its topics whose messages differ too much in length; `longest`: bytes up to which they are taken."""
     contents = locate(path)
-    types = TopicTypes(contents, KnownTypes(None if definitions is None else Path(definitions)))
+    types = TopicTypes(contents, known)
     with ThreadPoolExecutor(1, "pages") as helper:
-        reading = _Reading(topics, helper, contents, types)
+        reading = _Reading(topics, helper, contents, types, longest)
         for number, storage in enumerate(open_files(contents)):
             for channel, batch in inflated_batches(storage, reading.is_wanted, contents.findings):
                 reading.take(storage, channel, batch)
@@ -154,13 +173,19 @@ def read_bag(
                     share = storage.position / max(1, storage.size)
                     progress(int(100 * (number + share) / len(contents.files)))
             reading.finish(storage)
-        return reading.bag(path)
+        return reading.bag(path), reading.padded
 
 
 class _Reading:
     """What has been read so far, over all files of a bag."""
 
-    def __init__(self, topics: Collection[str] | None, helper: Executor, contents: Contents, types: TopicTypes) -> None:
+    def __init__(
+        self, topics: Collection[str] | None, helper: Executor, contents: Contents, types: TopicTypes,
+        longest: dict[str, int],
+    ) -> None:  # fmt: skip
+        self._longest = longest
+        self.padded: list[str] = []
+        """Topics whose messages differ too much in length."""
         self._helper = helper
         self._contents = contents
         self._types = types
@@ -242,13 +267,16 @@ class _Reading:
                     what = "definition of its type that does not match the recorded hash, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
                 helper = self._helper if is_large(storage.size) else None
-                self._tables[topic] = Table(definition.form, storage.expected(channel.id), helper)
+                expected, longest = storage.expected(channel.id), self._longest.get(topic)
+                self._tables[topic] = Table(definition.form, expected, helper, longest)
         except UndecodableError as error:
             self._refuse(topic, error)
         return self._tables.get(topic)
 
     def _refuse(self, topic: str, error: UndecodableError) -> None:
         self._refusals[topic] = f"cannot be decoded: {error}"
+        if isinstance(error, PaddingError):
+            self.padded.append(topic)
         table = self._tables.pop(topic, None)
         if isinstance(table, Table) and len(table.rows):
             self._undecoded.setdefault(topic, []).append(table.rows[LOG_TIME].copy())
@@ -283,6 +311,10 @@ class _Reading:
             if table.misfits:
                 what = f"{topic}: message that is not of its type, left out ({table.first_misfit})"
                 self._findings.add(what, table.misfits, is_loss=True)
+            if isinstance(table, Table) and table.overlong:
+                limit = f"message of more than {self._longest[topic] - LEAD} bytes"
+                what = f"{topic}: {limit}, far longer than the others, left out"
+                self._findings.add(what, table.overlong, is_loss=True)
         unclear = [topic for topic in arrays if not self._tables[topic].is_orderly]
         with ThreadPoolExecutor(_THREADS, "bag") as pool:
             for found in pool.map(check_times, unclear, map(arrays.__getitem__, unclear)):

@@ -15,3 +15,7 @@ class DamagedError(ValueError):
 
 class UndecodableError(ValueError):
     """A type whose messages cannot become arrays, or a message that is not of its type; the text says why."""
+
+
+class PaddingError(UndecodableError):
+    """Messages that differ so much in length that an array of them would be out of all proportion."""

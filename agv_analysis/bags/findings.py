@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from agv_ros.printable import printable
+
 
 @dataclass
 class _Kind:
@@ -48,7 +50,8 @@ class Findings:
     def texts(self) -> tuple[str, ...]:
         """One line for each kind, and one for all that no CRC covers."""
         found = tuple(_text(what, kind) for what, kind in self._kinds.items())
-        unchecked = ", ".join(f"{what}: {count}" for what, count in self._unchecked.items())
+        found = tuple(map(printable, found))
+        unchecked = printable(", ".join(f"{what}: {count}" for what, count in self._unchecked.items()))
         return (*found, f"not checked, because there is no CRC: {unchecked}") if unchecked else found
 
 

@@ -314,7 +314,9 @@ class McapFile:
             self._is_behind_data = True
             if record.extra:  # not where it was looked for
                 self._compare_data_section(record)
-        self._note(record.opcode, record.content, self._is_proven, record.position)
+        # The CRC of the data section says nothing of the summary, which has one of its own.
+        is_proven = self._is_proven and not self._is_behind_data
+        self._note(record.opcode, record.content, is_proven, record.position)
 
     def _note(self, opcode: int, content: bytes, is_proven: bool, position: int) -> None:
         """Take note of what a record holds, wherever it lies; `is_proven`: a CRC covers it."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
@@ -18,14 +17,8 @@ _CHUNK = 256 * 1024
 """Size of a chunk [B]: small, since a loop in real time in the same process waits while it is compressed."""
 
 
-class Recorded(NamedTuple):
-    """A message, in the order in which messages lie in a bag."""
-
-    log_time_ns: int
-    topic: int
-    """Number of its topic."""
-    data: bytes
-    publish_time_ns: int
+Recorded = tuple[int, int, bytes, int]
+"""A message: log time [ns], number of its topic, payload, publish time [ns]; in a bag in this order."""
 
 
 class _WholeWrites:
@@ -95,13 +88,13 @@ class McapOutput:
         self._writer.start(profile="ros2", library=f"agv_ncs {metadata[1].get('version', '')}".strip())
         self._writer.add_metadata(metadata[0], dict(metadata[1]))
 
-    def write(self, message: Recorded) -> None:
-        """Add a message. Raises OSError."""
-        if message.topic not in self._channels:
-            self.register(message.topic, self._describe[message.topic]())
-        self._writer.add_message(
-            self._channels[message.topic], message.log_time_ns, message.data, message.publish_time_ns
-        )
+    def write(self, messages: Iterable[Recorded]) -> None:
+        """Add messages. Raises OSError."""
+        channels, add = self._channels, self._writer.add_message
+        for log_time_ns, topic, data, publish_time_ns in messages:
+            if topic not in channels:
+                self.register(topic, self._describe[topic]())
+            add(channels[topic], log_time_ns, data, publish_time_ns)
 
     def register(self, number: int, topic: TopicInfo) -> None:
         """Put a topic into the file."""
@@ -146,4 +139,4 @@ class McapOutput:
         with self.path.open("rb") as file:
             for record in StreamReader(file).records:
                 if isinstance(record, Message):
-                    yield Recorded(record.log_time, numbers[record.channel_id], record.data, record.publish_time)
+                    yield record.log_time, numbers[record.channel_id], record.data, record.publish_time

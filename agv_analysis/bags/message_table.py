@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.bags.bag_errors import UndecodableError
+from agv_analysis.bags.bag_errors import PaddingError, UndecodableError
 from agv_analysis.bags.checks import check_times
 from agv_analysis.bags.compiled_decoder import MAX_LAYOUTS, Run, compiled_place, recipes
 from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf, length_path
@@ -33,10 +33,29 @@ _MAX_ROOM = 2**30
 """Most bytes that are set aside for messages which are merely expected."""
 
 
+def most_bytes(message_bytes: int) -> int:
+    """How many bytes an array may take of messages of so many."""
+    return max(_PADDING_FREE, _PADDING_FACTOR * message_bytes)
+
+
+def longest_in_proportion(sizes: Mapping[int, int]) -> int | None:
+    """The longest size [B] up to which messages fit into an array, if no more than one in a hundred is longer.
+
+    `sizes`: how many messages there are of each size. A row is taken for as wide as twice its message.
+    """
+    longer, kept, kept_bytes = sum(sizes.values()), 0, 0
+    total, found = longer, None
+    for size in sorted(sizes):
+        kept, kept_bytes, longer = kept + sizes[size], kept_bytes + size * sizes[size], longer - sizes[size]
+        if kept * 2 * size <= most_bytes(kept_bytes) and 0 < longer <= max(1, total // 100):
+            found = size
+    return found
+
+
 def refuse_padding(needed: int, message_bytes: int, rows: int) -> None:
-    """Raise UndecodableError if an array would take `needed` bytes, out of all proportion to its messages."""
-    if needed > max(_PADDING_FREE, _PADDING_FACTOR * message_bytes):
-        raise UndecodableError(
+    """Raise PaddingError if an array would take `needed` bytes, out of all proportion to its messages."""
+    if needed > most_bytes(message_bytes):
+        raise PaddingError(
             f"its strings or sequences differ so much in length that {rows} messages would take "
             f"{needed / 2**20:.0f} MiB as an array"
         )
@@ -93,8 +112,10 @@ def _columns(kind: Struct, prefix: str = "", dims: tuple[int, ...] = ()) -> Iter
 class Table:
     """Columns of a topic: `log_time_ns`, `publish_time_ns`, and one for each value of its type."""
 
-    def __init__(self, kind: Struct, expected: int = 0, helper: Executor | None = None) -> None:
-        """`expected`: messages to make room for; more may come.
+    def __init__(
+        self, kind: Struct, expected: int = 0, helper: Executor | None = None, longest: int | None = None
+    ) -> None:
+        """`expected`: messages to make room for; more may come. `longest`: bytes of the longest message that is taken.
 
         `helper` prepares memory; it is given where there are enough messages for this, and compiled code, to pay off.
         """
@@ -111,6 +132,9 @@ class Table:
         self._count = 0
         self._message_bytes = 0
         self.layouts = Layouts(kind)
+        self._longest = longest
+        self.overlong = 0
+        """Messages that were left out because they are longer than that."""
         self._place = compiled_place() if helper is not None and not self._ragged else None
         self._recipes = recipes([])
         self._known_layouts: dict[tuple[int, int], tuple[int, Layout]] = {}
@@ -143,6 +167,10 @@ class Table:
         Raises UndecodableError if none of the topic's messages is of its type, or if the array would grow out of all
         proportion to its messages.
         """
+        if self._longest is not None:
+            short = batch.sizes <= self._longest
+            self.overlong += len(batch) - int(np.count_nonzero(short))
+            batch = Batch(batch.buffer, batch.starts[short], batch.sizes[short])
         self._message_bytes += batch.total
         done = 0
         while self._place is not None and done < len(batch):

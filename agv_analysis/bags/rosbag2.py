@@ -21,6 +21,7 @@ from agv_analysis.bags.mcap_file import McapFile
 from agv_analysis.bags.packed_files import is_packed, refuse_archive, unpack
 from agv_analysis.bags.records import MAGIC as MCAP
 from agv_analysis.bags.storage import Storage
+from agv_ros.errors import refuse_irregular
 
 METADATA = "metadata.yaml"
 
@@ -174,6 +175,7 @@ def open_files(contents: Contents, keep_all: bool = False) -> Iterator[Storage]:
 
 def _beginning(path: Path) -> bytes:
     try:
+        refuse_irregular(path)
         with path.open("rb") as file:
             return file.read(512)
     except OSError as error:
@@ -298,7 +300,7 @@ def _by_metadata(path: Path) -> Contents:
     contents = Contents([], counts, types, str(about.get("ros_distro") or ""))
     custom = about.get("custom_data")
     contents.custom_data = {str(key): str(text) for key, text in custom.items()} if isinstance(custom, dict) else None
-    contents.files = _present(path, listed, contents.findings)
+    contents.files = _once(_present(path, listed, contents.findings), contents.findings)
     if not contents.files:
         raise BagError(f"{path}: none of the files that {METADATA} names is there{_advice(path)}")
     if about.get("compression_format") not in (None, "", "zstd"):
@@ -337,11 +339,23 @@ def _present(path: Path, listed: list[Path], findings: Findings) -> list[Path]:
     return present + renamed
 
 
+def _once(files: list[Path], findings: Findings) -> list[Path]:
+    """Files without those that are another name of one before them."""
+    known: dict[tuple[int, int], Path] = {}
+    for file in files:
+        about = file.stat()
+        first = known.setdefault((about.st_dev, about.st_ino), file)
+        if first is not file:
+            findings.add(f"{file.name} is {first.name} by another name, not read again")
+    return list(known.values())
+
+
 def _read_metadata(path: Path) -> dict[str, Any]:
     """Content of a metadata.yaml. Raises ValueError, TypeError or KeyError if it is none."""
     import yaml
 
     try:
+        refuse_irregular(path)
         with path.open("rb") as file:
             text = file.read(min(path.stat().st_size, _MAX_METADATA) + 1)
         if len(text) > _MAX_METADATA:

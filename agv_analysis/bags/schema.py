@@ -147,17 +147,19 @@ class _Unfolding:
         """Members of the type `name`, their paths beginning with `prefix`."""
         if depth > _MAX_DEPTH:
             raise UndecodableError(f"its definition is nested more than {_MAX_DEPTH} deep")
-        empty = True
+        known: set[str] = set()
         for line in self._texts[name].splitlines():
             member = parse_line(line)
             if member is None:
                 continue
-            empty = False
+            if member.path in known:
+                raise UndecodableError(f"its definition declares {prefix}{member.path} twice")
+            known.add(member.path)
             self._count += 1
             if self._count > _MAX_MEMBERS:
                 raise UndecodableError(f"its definition has more than {_MAX_MEMBERS} members")
             yield from self._unfold(name, prefix, member, depth)
-        if empty:
+        if not known:
             yield Member(f"{prefix}{PLACEHOLDER}", "u1")
 
     def _unfold(self, parent: str, prefix: str, member: Member, depth: int) -> Iterator[Member]:

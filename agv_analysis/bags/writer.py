@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -99,7 +100,7 @@ class BagWriter:
 
     def write(self, topic: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add a message to the topic with this number."""
-        self._pending.append(Recorded(log_time_ns, topic, data, publish_time_ns))
+        self._pending.append((log_time_ns, topic, data, publish_time_ns))
         self.counts[topic] += 1
         self._young += 1
         if len(self._pending) >= self._room:
@@ -150,14 +151,15 @@ class BagWriter:
         if count <= 0:
             return
         self._pending.sort()
-        for message in self._pending[:count]:
-            if self._newest is not None and message < self._newest and len(self._late) <= _MOST_LATE:
-                self._late.append(message)
-            else:
-                self._newest = message
-            self._file.write(message)
-        self._first_ns = min(self._first_ns, self._pending[0].log_time_ns)
-        self._last_ns = max(self._last_ns, self._pending[count - 1].log_time_ns)
+        ready = self._pending[:count]
+        late = 0 if self._newest is None else bisect_left(ready, self._newest)
+        if late and len(self._late) <= _MOST_LATE:
+            self._late += ready[:late]
+        if late < count:
+            self._newest = ready[-1]
+        self._file.write(ready)
+        self._first_ns = min(self._first_ns, ready[0][0])
+        self._last_ns = max(self._last_ns, ready[-1][0])
         del self._pending[:count]
 
     def _put_in_order(self) -> None:
@@ -169,8 +171,7 @@ class BagWriter:
             try:
                 for number in self._first:
                     file.register(number, self._file.topics[number])
-                for message in heapq.merge(self._in_order(), sorted(self._late)):
-                    file.write(message)
+                file.write(heapq.merge(self._in_order(), sorted(self._late)))
                 file.finish(self._said)
                 path.replace(self._file.path)
             except OSError:

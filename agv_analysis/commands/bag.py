@@ -49,12 +49,13 @@ def info(bag: Path, definitions: Path | None, json_file: Path | None) -> None:
     """
     from agv_analysis.bags import read_bag
     from agv_analysis.bags.bag_summary import describe
+    from agv_ros.printable import printable
 
     with _bar(bag, "reading") as progress:
         content = read_bag(bag, progress=progress, definitions=definitions)
     summary = describe(content)
     for line in summary.lines():
-        click.echo(line)
+        click.echo(printable(line))
     if json_file is not None:
         write_json(json_file, summary.to_json())
 
@@ -113,11 +114,12 @@ def recover(bag: Path, out: Path, definitions: Path | None) -> None:
       agv-ncs bag recover bags/interrupted bags/recovered
     """
     from agv_analysis.bags.recover import recover as recover_bag
+    from agv_ros.printable import printable
 
     with _bar(bag, "copying") as progress:
         recovery = recover_bag(bag, out, progress, definitions)
     for topic, count in recovery.counts.items():
-        click.echo(f"{topic}: {count} messages")
+        click.echo(f"{printable(topic)}: {count} messages")
     click.echo(f"{out}: {sum(recovery.counts.values())} messages")
     _warn(recovery.problems, recovery.is_complete)
 

@@ -27,7 +27,7 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
     poses = on_steps["agv/pose"].k
     first = max((messages.k[0] for messages in on_steps.values() if len(messages.k)), default=0) if poses[0] else 0
     expected = {
-        "agv/pose": np.arange(first, poses[-1] + 1),
+        "agv/pose": poses,
         "edge/slot": poses,
         "edge/pose": _passed_on(on_steps["edge/slot"], poses[-1]),
         "edge/error": _where(on_steps["edge/slot"], lambda slots: stamps_of(slots, "time_ref") >= grid.start_ns),
@@ -47,6 +47,7 @@ def unexplained(on_steps: Mapping[str, OnSteps], grid: Grid) -> dict[str, int]:
         for topic, k in expected.items()
         if topic in on_steps
     }
+    missing["agv/pose"] = int(poses[-1] - first) - int(np.count_nonzero((poses >= first) & (poses < poses[-1])))
     return {topic: count for topic, count in missing.items() if count}
 
 

@@ -30,7 +30,8 @@ from agv_analysis.recordings.receive_times import (
     usable_from,
 )
 from agv_analysis.run import Run, Timing
-from agv_ros.stamps import NS_PER_S, Grid
+from agv_analysis.scenario import Scenario
+from agv_ros.stamps import NS_PER_S
 
 START_UP = 0.1
 """A run in real time may take this time [s] from its first step until its nodes keep pace."""
@@ -67,7 +68,7 @@ def with_timing(
     if not is_timed(bag, run):
         return run
     said = None if diagnostics is None else deadlines_of(diagnostics, namespace, len(run))
-    topics = {topic: _as_received(bag[name], run.scenario.grid) for topic, name in names.items()}
+    topics = {topic: _as_received(bag[name], run.scenario) for topic, name in names.items()}
     poses = topics["agv/pose"]
     stamps, logs = stamps_of(poses.messages), _logs(poses)
     unknown = says_nothing(stamps, logs)
@@ -105,9 +106,10 @@ def deadlines_of(diagnostics: NDArray[np.void], namespace: str, steps: int) -> D
     )
 
 
-def _as_received(messages: NDArray[np.void], grid: Grid) -> OnSteps:
+def _as_received(messages: NDArray[np.void], scenario: Scenario) -> OnSteps:
     """The messages of a topic, of each step the one that came first."""
-    return on_steps(messages[np.argsort(messages[LOG_TIME], kind="stable")], grid)
+    in_order = messages[np.argsort(messages[LOG_TIME], kind="stable")]
+    return on_steps(in_order, scenario.grid, scenario.plant.window_steps)
 
 
 def _logs(messages: OnSteps) -> Steps:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.run import Floats
 from agv_ros.messages import SQUARED_LENGTH, yaw_of_quaternion
-from agv_ros.stamps import NS_PER_S, Grid
+from agv_ros.stamps import AGREEING, NS_PER_S, Grid
 
 Steps = NDArray[np.int64]
 
@@ -26,6 +26,8 @@ class OnSteps(NamedTuple):
     off_grid: int
     repeated: int
     unusable: int = 0
+    far: int = 0
+    """Messages whose steps are far from all others, as no node takes them."""
 
     def at(self, k: Steps) -> tuple[Steps, NDArray[np.bool_]]:
         """Index of the message of each of the steps `k`, and whether there is one (else the index means nothing)."""
@@ -51,19 +53,35 @@ def stamps_of(messages: NDArray[np.void], field: str = "header.stamp") -> Steps:
     return np.asarray(messages[f"{field}.sec"].astype(np.int64) * NS_PER_S + messages[f"{field}.nanosec"])
 
 
-def on_steps(messages: NDArray[np.void], grid: Grid) -> OnSteps:
-    """The messages of a topic on the sampling instants of a grid; the first of each step counts."""
+def on_steps(messages: NDArray[np.void], grid: Grid, window: int) -> OnSteps:
+    """The messages of a topic on the sampling instants of a grid; the first of each step counts.
+
+    Fewer than AGREEING steps that are more than `window` steps from all others are taken for wrong stamps.
+    """
     k, rest = np.divmod(stamps_of(messages) - grid.start_ns, grid.ts_ns)
     on_grid, usable = (rest == 0) & (k >= 0), _usable(messages)
-    taken = on_grid & usable
+    near = _near(k, on_grid, window)
+    taken = on_grid & usable & near
     first_k, first = np.unique(k[taken], return_index=True)
     return OnSteps(
         k=first_k,
         messages=messages[taken][first],
         off_grid=int(np.count_nonzero(~on_grid)),
         repeated=int(np.count_nonzero(taken)) - len(first),
-        unusable=int(np.count_nonzero(on_grid & ~usable)),
+        unusable=int(np.count_nonzero(on_grid & near & ~usable)),
+        far=int(np.count_nonzero(on_grid & ~near)),
     )
+
+
+def _near(k: Steps, on_grid: NDArray[np.bool_], window: int) -> NDArray[np.bool_]:
+    """Which of the steps `k` are not far from the others, shape (N,); all, if there is no group of AGREEING."""
+    known, group = np.unique(k[on_grid], return_inverse=True)
+    of_known = np.cumsum(np.diff(known, prepend=known[:1]) > window)
+    is_large = np.bincount(of_known, minlength=1) >= AGREEING
+    near = np.ones(len(k), dtype=np.bool_)
+    if is_large.any():
+        near[on_grid] = is_large[of_known][group]
+    return near
 
 
 def _usable(messages: NDArray[np.void]) -> NDArray[np.bool_]:

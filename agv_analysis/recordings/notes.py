@@ -33,6 +33,8 @@ def of_messages(on_steps: Mapping[str, OnSteps], names: Mapping[str, str]) -> It
     for topic, messages in on_steps.items():
         if messages.off_grid:
             yield f"{names[topic]}: {messages.off_grid} messages are no sampling instant's, they are left out"
+        if messages.far:
+            yield f"{names[topic]}: {messages.far} messages have stamps far from all others, they are left out"
         if messages.unusable:
             yield f"{names[topic]}: {messages.unusable} messages with numbers that no node takes, they are left out"
         if messages.repeated:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +32,22 @@ from agv_analysis.simulation.reference import reference_of
 from agv_cloud.parameters import PATH
 from agv_ros.errors import UserError
 
-TOPICS = (
-    "agv/pose", "agv/ground_truth", "edge/pose", "edge/slot", "edge/age", "edge/error", "edge/reference_pose",
-    "edge/cmd_vel", "agv/cmd_vel", "agv/slot",
-)  # fmt: skip
+_POSE, _SLOT = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/TimeReference"
+_COMMAND, _ERROR = "geometry_msgs/msg/TwistStamped", "nav_msgs/msg/Odometry"
+
+TOPICS = {
+    "agv/pose": _POSE, "agv/ground_truth": _POSE, "edge/pose": _POSE, "edge/slot": _SLOT, "edge/age": _SLOT,
+    "edge/error": _ERROR, "edge/reference_pose": _POSE, "edge/cmd_vel": _COMMAND, "agv/cmd_vel": _COMMAND,
+    "agv/slot": _SLOT,
+}  # fmt: skip
+"""What is read, with its type."""
+
+_DIAGNOSTICS, _EVENT = "diagnostic_msgs/msg/DiagnosticArray", "rcl_interfaces/msg/ParameterEvent"
 
 _NEEDED = ("agv/pose", "edge/slot", "edge/error", "edge/cmd_vel")
+
+_MOST_STEPS = 20_000_000
+"""Steps of a reference that are computed: 28 hours at 5 ms, in 800 MB."""
 
 _NO_TRUTH = "the AGV measures its pose with noise, and agv/ground_truth is not in the recording: errors hold the noise"
 
@@ -55,10 +65,13 @@ def read_run(path: Path, config: Path | None = None, namespace: str | None = Non
     namespace = names["agv/pose"].removesuffix("agv/pose")
     own = f"{namespace}diagnostics"  # of a vehicle of a fleet
     diagnostics = own if own in bag.topics else restarts.TOPIC
-    bag = read_bag(path, topics=(*names.values(), diagnostics, EVENTS))
+    beside = [name for name, kind in ((diagnostics, _DIAGNOSTICS), (EVENTS, _EVENT)) if _is(bag, name, kind)]
+    foreign = tuple(_foreign_topics(bag, namespace))
+    bag = read_bag(path, topics=(*names.values(), *beside))
     said = said_by_nodes(bag, names, diagnostics, scenario, str(config or "the parameters in the bag"))
     run = _run(bag, names, said, str(path))
-    reports = bag[diagnostics] if diagnostics in bag.topics else None
+    run = dataclasses.replace(run, notes=(*run.notes, *foreign))
+    reports = bag[diagnostics] if diagnostics in beside and diagnostics in bag else None
     if reports is not None:
         again = restarts.restarts(reports, namespace, run.scenario.grid)
         run = dataclasses.replace(run, notes=(*run.notes, *again))
@@ -78,7 +91,30 @@ def loop_topics(bag: Bag, path: Path, namespace: str | None) -> dict[str, str]:
     if missing:
         there = ", ".join(sorted(bag.topics)) or "none at all"
         raise UserError(f"{path}: no recording of the loop, it has no topic {', '.join(missing)}; it has {there}")
-    return {topic: prefix + topic for topic in TOPICS if prefix + topic in bag.topics}
+    wrong = {topic: bag.topics[prefix + topic].type for topic in _NEEDED if not _has_type(bag, prefix, topic)}
+    if wrong:
+        is_other = ", ".join(
+            f"{prefix}{topic} has the type {kind}, not {TOPICS[topic]}" for topic, kind in wrong.items()
+        )
+        raise UserError(f"{path}: no recording of the loop: {is_other}")
+    return {topic: prefix + topic for topic in TOPICS if _has_type(bag, prefix, topic)}
+
+
+def _is(bag: Bag, name: str, kind: str) -> bool:
+    """Is there a topic of this name and type?"""
+    return name in bag.topics and bag.topics[name].type in ("", kind)
+
+
+def _has_type(bag: Bag, prefix: str, topic: str) -> bool:
+    """Is this topic of the loop in the bag, with its own type? A bag may not know the type of what is empty."""
+    return _is(bag, prefix + topic, TOPICS[topic])
+
+
+def _foreign_topics(bag: Bag, prefix: str) -> Iterator[str]:
+    """Topics with a name of the loop's and another type, in words."""
+    for topic, kind in TOPICS.items():
+        if prefix + topic in bag.topics and not _has_type(bag, prefix, topic):
+            yield f"{prefix}{topic} has the type {bag.topics[prefix + topic].type}, not {kind}, and is not used"
 
 
 def _scenario(bag: Bag, path: Path, config: Path | None) -> Scenario:
@@ -92,7 +128,7 @@ def _scenario(bag: Bag, path: Path, config: Path | None) -> Scenario:
 
 def _run(bag: Bag, names: dict[str, str], said: Said, source: str) -> Run:
     scenario = said.scenario
-    topics = {topic: on_steps(bag[name], scenario.grid) for topic, name in names.items()}
+    topics = {topic: on_steps(bag[name], scenario.grid, scenario.plant.window_steps) for topic, name in names.items()}
     stamps = {topic: stamps_of(bag[names[topic]]) for topic in ("agv/pose", "edge/slot")}
     refuse_other_grid(topics, stamps, scenario.grid, source)
     poses, slots = topics["agv/pose"], topics["edge/slot"]
@@ -102,6 +138,11 @@ def _run(bag: Bag, names: dict[str, str], said: Said, source: str) -> Run:
             f"{source}: no step of the loop in it: {len(bag[names['agv/pose']])} poses and "
             f"{len(bag[names['edge/slot']])} slots, of which {poses.off_grid} and {slots.off_grid} are not on the grid "
             f"of {scenario.plant.start_time:g} s + k * {scenario.plant.ts:g} s: are these the run's parameters?"
+        )
+    if k[-1] >= _MOST_STEPS:
+        raise UserError(
+            f"{source}: its last step is {k[-1]}, and the reference is computed from step 0 on, for {_MOST_STEPS} "
+            "steps at most: is plant.start_time in the parameters the run's?"
         )
     n_ul, lost, uplink = slot_outcomes(slots, k, scenario.grid)
     ages = topics.get("edge/age", NOTHING)

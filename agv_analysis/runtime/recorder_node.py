@@ -173,7 +173,12 @@ class RecorderNode(LoopNode[RecorderParameters]):
         schema = schema_of(type_name)  # now, not in the middle of a run in real time
 
         def describe() -> TopicInfo:
-            publishers = [info for side in sides for info in side.get_publishers_info_by_topic(topic)]
+            publishers = [
+                info
+                for side in sides
+                for info in side.get_publishers_info_by_topic(topic)
+                if info.topic_type == type_name  # others may publish another type under the same name
+            ]
             offered = [_qos(info.qos_profile) for info in publishers]
             distinct = [qos for i, qos in enumerate(offered) if qos not in offered[:i]]
             type_hash = str(publishers[0].topic_type_hash) if publishers else ""

@@ -255,6 +255,7 @@ def test_one_long_message_among_short_ones_does_not_take_all_memory() -> None:
         ("a/B b", "without describing it"),
         ("a/A a", "nested more than"),
         ("int32", "not understood"),
+        ("int32 x\nfloat64 y\nint32 x", "declares x twice"),
         ("int32 x\n" + "=" * 80 + "\nnothing", "instead of 'MSG: type'"),
     ],
 )  # fmt: skip

@@ -5,7 +5,9 @@ from __future__ import annotations
 import bz2
 import contextlib
 import gzip
+import json
 import lzma
+import os
 import sqlite3
 import tarfile
 import zipfile
@@ -16,6 +18,7 @@ import pytest
 import zstandard
 
 from agv_analysis.bags import BagError, read_bag
+from agv_ros.printable import printable
 
 Payloads = dict[str, list[tuple[int, bytes]]]
 Odd = Callable[[str], Path]
@@ -208,8 +211,6 @@ def test_a_file_that_was_compressed_by_hand_is_read(
 
 @pytest.mark.parametrize("ending", PACKERS)
 def test_of_a_compressed_file_that_was_cut_the_beginning_is_read(tmp_path: Path, odd_bag: Odd, ending: str) -> None:
-    import os
-
     path = odd_bag("mcap")
     size = 2**21 if ending == ".bz2" else 2**17  # bzip2 inflates whole blocks of 900 kB
     data = path.read_bytes() + os.urandom(size)  # behind the end, so that the cut is there
@@ -241,3 +242,32 @@ def test_an_error_names_the_compressed_file_and_not_what_was_made_of_it(tmp_path
     (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(b"no bag at all, but long enough for it"))
     with pytest.raises(BagError, match=f"^{tmp_path}/a.mcap.gz: is no MCAP file"):
         read_bag(tmp_path / "a.mcap.gz")
+
+
+def test_a_data_file_is_read_once_whatever_its_names(odd_bag: Odd, tmp_path: Path) -> None:
+    folder = odd_bag("no storage identifier")
+    data = next(folder.glob("*.db3"))
+    links = [folder / f"again_{i}.db3" for i in range(5)]
+    for link in links:
+        link.symlink_to(data.name)
+    metadata = folder / "metadata.yaml"
+    names = [f"./{data.name}", f"elsewhere/{data.name}", *(link.name for link in links)]
+    metadata.write_text(metadata.read_text().replace(f'"{data.name}"', json.dumps(names)[1:-1]))
+    bag = read_bag(folder)
+    assert bag.topics["/point"].count == 7
+    assert f"again_0.db3 is {data.name} by another name, not read again: 1" in bag.problems
+
+
+@pytest.mark.parametrize("name", ["bag.mcap", "metadata.yaml"])
+def test_a_pipe_is_no_bag(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    for path in (tmp_path / name, tmp_path):
+        with pytest.raises(BagError, match=r"is a pipe or a device|there is no .mcap or .db3 file"):
+            read_bag(path)
+    with pytest.raises(BagError, match="is a pipe or a device"):
+        read_bag("/dev/zero")
+
+
+def test_what_a_terminal_would_obey_is_shown() -> None:
+    assert printable("/\x1b]0;owned\x07\x9b2J\u202epose\udc80") == r"/\x1b]0;owned\x07\x9b2J\u202epose\udc80"
+    assert printable("Straße 5 µm\n") == "Straße 5 µm\n"

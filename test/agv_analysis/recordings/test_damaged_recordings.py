@@ -16,6 +16,7 @@ from mcap.writer import CompressionType, Writer
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.stability.analysis import analyse
+from agv_ros.errors import UserError
 
 SAMPLE = Path(__file__).parents[3] / "bags/sample"
 STEPS = 400
@@ -63,6 +64,11 @@ def with_stamp(topic: str, sec: int, nanosec: int) -> Change:
     return lambda k, name, data: [data[:4] + stamp + data[12:] if name == topic and k % 50 == 25 else data]
 
 
+def _with_frame(data: bytes, length: int) -> bytes:
+    """A PoseStamped in frame `map` with a frame of another length."""
+    return data[:12] + struct.pack("<I", length) + b"a" * (length - 1) + b"\0" + data[20:]
+
+
 class Damage(NamedTuple):
     """What was done, and how it is said; `missing`: messages of the topic that then count as missing."""
 
@@ -99,6 +105,13 @@ DAMAGES = {
     "twice": Damage(
         lambda k, topic, data: [data] * (1 + (topic == "/agv/pose" and k % 50 == 25)),
         "/agv/pose: 8 messages repeat a step, the first of each counts", missing=0,
+    ),
+    "two million steps ahead": Damage(
+        with_stamp("/agv/pose", 10_001, 0), "/agv/pose: 8 messages have stamps far from all others, they are left out"
+    ),
+    "a name of a megabyte": Damage(
+        lambda k, topic, data: [_with_frame(data, 10**6 + 4) if topic == "/agv/pose" and k == 100 else data],
+        "/agv/pose: message of more than 76 bytes, far longer than the others, left out: 1", missing=1,
     ),
     "cut": Damage(
         lambda k, topic, data: [data[:-9] if topic == "/agv/pose" and k % 50 == 25 else data],
@@ -161,3 +174,42 @@ def test_messages_in_any_order_are_the_same_run(tmp_path: Path, whole: Run) -> N
     assert len(run) == STEPS
     for name in ("k", "pose", "command", "n_ul", "lost"):
         assert np.array_equal(getattr(run, name), getattr(whole, name)), name
+
+
+def test_a_topic_of_another_type_under_a_name_of_ours(tmp_path: Path, whole: Run) -> None:
+    def retyped(path: Path, topic: str) -> Path:
+        """The sample with the messages of a topic as another type that has a header, too."""
+        with next(SAMPLE.glob("*.mcap")).open("rb") as source, path.open("xb") as target:
+            writer, channels = Writer(target), {}
+            writer.start(profile="ros2")
+            for schema, channel, sent in make_reader(source).iter_messages(log_time_order=False):
+                if schema is None or sent.log_time > 2 * 10**9:
+                    continue
+                if channel.id not in channels:
+                    is_other = channel.topic == topic
+                    about = ("my_msgs/msg/Text", b"string text") if is_other else (schema.name, schema.data)
+                    number = writer.register_schema(about[0], schema.encoding, about[1])
+                    channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+                data = b"\0\1\0\0\5\0\0\0text\0" if channel.topic == topic else sent.data
+                writer.add_message(channels[channel.id], sent.log_time, data, sent.publish_time)
+            writer.finish()  # type: ignore[no-untyped-call]
+        return path
+
+    config = Path(__file__).parents[3] / "config/outages.yaml"
+    with pytest.raises(UserError, match=r"/agv/pose has the type my_msgs/msg/Text, not geometry_msgs/msg/PoseStamped"):
+        read_run(retyped(tmp_path / "pose.mcap", "/agv/pose"), config)
+    for topic in ("/agv/slot", "/diagnostics"):
+        run = read_run(retyped(tmp_path / f"{topic[1:3]}.mcap", topic), config)
+        assert len(run) == 201
+        assert any("/agv/slot has the type my_msgs/msg/Text" in note for note in run.notes) == (topic == "/agv/slot")
+
+
+def test_a_definition_that_was_damaged_in_the_summary_is_taken_from_the_chunk(tmp_path: Path) -> None:
+    """A bit that makes of y another x: the CRC of the data section does not cover the summary."""
+    source = next(SAMPLE.glob("*.mcap"))
+    content = bytearray(source.read_bytes())
+    content[content.rindex(b"float64 x\nfloat64 y") + len(b"float64 x\nfloat64 ")] ^= 1
+    (tmp_path / "flipped.mcap").write_bytes(content)
+    run, whole = read_run(tmp_path / "flipped.mcap"), read_run(source)
+    np.testing.assert_array_equal(run.command, whole.command)
+    assert any("defined in two ways, the one that a CRC covers is used" in note for note in run.notes)
