@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from agv_analysis.output_file import output_file
+
 if TYPE_CHECKING:
     from agv_analysis.corridor.corridor_of_run import CorridorOfRun
     from agv_analysis.scenario import Scenario
@@ -102,7 +104,7 @@ def needs_ros(otherwise: str = "") -> Iterator[None]:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file; a path that cannot be written is the user's error."""
     try:
-        path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        output_file(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None
 

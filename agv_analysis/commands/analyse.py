@@ -49,6 +49,7 @@ def command(
       agv-ncs analyse from_ros2_bag_record --config config/paper.yaml
       agv-ncs analyse robot --pose-topic /odom --command-topic /cmd_vel --reference-topic /plan
     """
+    from agv_analysis.output_file import output_file
     from agv_analysis.recordings.other_robots import read_robot_run
     from agv_analysis.recordings.recording import read_run
     from agv_analysis.recordings.robot_topics import read_topics
@@ -56,6 +57,7 @@ def command(
     from agv_analysis.report.table import print_table
     from agv_analysis.stability.analysis import analyse, observe
 
+    where = output_file(picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png")))
     if any((pose_topic, command_topic, reference_topic, track_file, topics)):
         if namespace is not None:
             raise click.UsageError("--namespace chooses one of several loops; another robot's topics are named in full")
@@ -64,7 +66,6 @@ def command(
     else:
         run = read_run(bag, config, namespace)
     analysis = analyse(run) if run.gains_known else observe(run)
-    where = picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png"))
     draw(run, where)
     print_table(analysis)
     scenario = run.scenario.with_settings(corridor_settings(corridor_width, corridor_along), "--corridor")

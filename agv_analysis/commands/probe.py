@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from agv_analysis.output_file import output_file
+
 
 @click.command("probe")
 @click.argument("host", required=False)
@@ -78,7 +80,7 @@ def _measure(host: str, port: int, interval: float, duration: float, size: int |
             host, port, count, interval, size or len(pose), min(size or len(command), len(command)), progress
         )
     try:
-        trace.write_text("\n".join(link_probe.rows_of(found)) + "\n", encoding="utf-8")
+        output_file(trace).write_text("\n".join(link_probe.rows_of(found)) + "\n", encoding="utf-8")
     except OSError as error:
         raise click.ClickException(f"{trace}: cannot be written: {error.strerror}") from None
     up = sum(arrived is None for arrived in found.arrived)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import corridor_settings, with_settings, write_json
+from agv_analysis.output_file import output_file
 
 if TYPE_CHECKING:
     from agv_analysis.requirements.link_availability import LinkAvailability
@@ -226,6 +227,6 @@ def _print(
 
 def _write(path: Path, text: str) -> None:
     try:
-        path.write_text(text, encoding="utf-8")
+        output_file(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None

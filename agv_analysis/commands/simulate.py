@@ -18,6 +18,7 @@ from agv_analysis.commands import (
     with_settings,
     write_json,
 )
+from agv_analysis.output_file import output_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -105,7 +106,7 @@ def write_csv(path: Path, run: Run) -> None:
         *_reasons(run),
     )
     try:
-        with open(path, "w", encoding="utf-8", newline="") as file:
+        with open(output_file(path), "w", encoding="utf-8", newline="") as file:
             rows = csv.writer(file)
             rows.writerow(COLUMNS)
             rows.writerows(zip(*(array.tolist() for array in arrays), strict=True))

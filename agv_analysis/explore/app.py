@@ -1,16 +1,24 @@
-"""The explorer's page, made with Dash: it listens on 127.0.0.1 alone and loads nothing from elsewhere."""
+"""The explorer's page, made with Dash: it listens on 127.0.0.1 alone, to who knows its address, and loads nothing."""
 
 from __future__ import annotations
 
 import importlib
+import secrets
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from agv_analysis.corridor.widths import widths_of
-from agv_analysis.explore.background_criteria import LatestOnlyWorker, compared_criteria_rows, tube_traces
+from agv_analysis.explore.background_criteria import (
+    LatestOnlyWorker,
+    WorkerDiedError,
+    compared_criteria_rows,
+    tube_traces,
+)
+from agv_analysis.explore.guard import check_request, guard, said
 from agv_analysis.explore.response import respond
-from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, values_of
+from agv_analysis.explore.settings import PRESETS, Values, preset_values, scenario_of, values_of
 from agv_analysis.explore.sliders import (
     CHOICES,
     GAIN_SLIDERS,
@@ -72,16 +80,25 @@ _AGAIN, _PAUSE = 4, 400
 A browser compiles what it has run some times: so it has before a hand moves the first slider.
 """
 
+_DIED = [("Not computed", "the process that computes it ended; the next move starts another", "")]
+
 _MOVED_ON = [("Not computed", "the page was moved on", "")]
 
 
-def build(base: Scenario, criteria: CriteriaRows = compared_criteria_rows, tube: TubeTraces = tube_traces) -> Any:
-    """The page as a Dash app; `criteria` and `tube` may take their time. Raises UserError if Dash is not installed."""
+def build(
+    base: Scenario, criteria: CriteriaRows = compared_criteria_rows, tube: TubeTraces = tube_traces, path: str = "/"
+) -> Any:
+    """The page as a Dash app at a path; `criteria` and `tube` may take their time.
+
+    Raises UserError if Dash is not installed.
+    """
     try:
         dash: Any = importlib.import_module("dash")
     except ImportError:
         raise UserError("the explorer needs Dash: pip install dash") from None
-    app = dash.Dash("agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets")
+    app = dash.Dash(
+        "agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets", url_base_pathname=path
+    )
     app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
     app.layout = _layout(dash, values_of(base))
     _connect(dash, app, base, criteria, tube)
@@ -153,8 +170,13 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     Input, Output, State = dash.Input, dash.Output, dash.State
     inputs, states = [Input(key, "value") for key in KEYS], [State(key, "value") for key in KEYS]
 
+    folder = Path.cwd()
+
     def values(given: tuple[Any, ...]) -> dict[str, Any]:
         return dict(zip(KEYS, given, strict=True))
+
+    def asked(settings: Values) -> Scenario:
+        return check_request(base, scenario_of(base, settings), folder)
 
     @app.callback(
         Output("plot-track", "figure"), Output("plot-time", "figure"), Output("summary", "children"),
@@ -164,10 +186,10 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     def move(*given: Any) -> Any:
         *settings, pinned, _ = given
         try:
-            other = None if pinned is None else scenario_of(base, pinned)
-            found = respond(scenario_of(base, values(tuple(settings))), other)
+            other = None if pinned is None else asked(pinned)
+            found = respond(asked(values(tuple(settings))), other)
         except UserError as error:
-            return dash.no_update, dash.no_update, dash.no_update, str(error), "old"
+            return dash.no_update, dash.no_update, dash.no_update, said(error), "old"
         return found.track, found.time, _table(dash.html, found.rows), "", "old"
 
     @app.callback(*(Output(key, "style") for key in SHOWN_FOR_A_LAW), Input("law", "value"), prevent_initial_call=True)
@@ -181,10 +203,12 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     def over_the_lap(_: Any, *given: Any) -> Any:  # after `move` has answered, so as not to keep it from that
         *settings, pinned = given
         try:
-            scenario = scenario_of(base, values(tuple(settings)))
-            found = criteria(scenario, None if pinned is None else scenario_of(base, pinned))
+            scenario = asked(values(tuple(settings)))
+            found = criteria(scenario, None if pinned is None else asked(pinned))
         except UserError:  # `move` says why
             return [], ""
+        except WorkerDiedError:
+            return _table(dash.html, _DIED), ""
         return _table(dash.html, _MOVED_ON if found is None else found), ""
 
     @app.callback(
@@ -193,9 +217,9 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     )  # fmt: skip
     def draw_tube(_: Any, *given: Any) -> Any:  # after the criteria, on the track as `move` drew it
         try:
-            scenario = scenario_of(base, values(given))
+            scenario = asked(values(given))
             found = None if widths_of(scenario.error_detector) is None else tube(scenario)
-        except UserError:  # `move` says why
+        except (UserError, WorkerDiedError):  # `move` and the criteria say why
             found = None
         if not found:
             return dash.no_update
@@ -225,9 +249,9 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     )  # fmt: skip
     def export(_: Any, *given: Any) -> Any:
         try:
-            text = scenario_of(base, values(given)).to_yaml()
+            text = asked(values(given)).to_yaml()
         except UserError as error:
-            return str(error), dash.no_update
+            return said(error), dash.no_update
         command = "agv-ncs simulate explored.yaml --report explored.html"
         return f"{command}\n\n# explored.yaml\n{text}", {"content": text, "filename": "explored.yaml"}
 
@@ -245,7 +269,8 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
     Raises UserError if the port is taken or Dash is not installed.
     """
     criteria, tube = LatestOnlyWorker(compared_criteria_rows, rest=_REST), LatestOnlyWorker(tube_traces)
-    app = build(base, criteria, tube)
+    path = f"/{secrets.token_urlsafe(16)}/"
+    app = build(base, criteria, tube, path)
     werkzeug: Any = importlib.import_module("werkzeug.serving")
     lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections
     quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
@@ -253,9 +278,11 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
         server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet)
     except (OSError, SystemExit) as error:
         raise UserError(f"port {port} of {HOST} cannot be used: {error}: choose another with --port") from None
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    guard(app.server, server.server_port)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
     try:
-        ready(f"http://{HOST}:{server.server_port}/")
+        ready(f"http://{HOST}:{server.server_port}{path}")
         server.serve_forever()
     except KeyboardInterrupt:
         pass

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import multiprocessing
 import os
+import resource
 import signal
 import threading
 from collections.abc import Callable
@@ -20,6 +21,9 @@ R = TypeVar("R")
 _NICE = 19
 """Background computations yield to the page and to the browser."""
 
+
+_MOST_MEMORY = 8 * 2**30
+"""Most address space [B] of background computations, of which a part is memory."""
 
 _LAPS = 50
 """Laps that are simulated for a corridor."""
@@ -83,6 +87,10 @@ def _growth(factor: float) -> str:
     return f"unstable: errors grow by {100.0 * (factor - 1.0):.2g} % per step"
 
 
+class WorkerDiedError(RuntimeError):
+    """The other process has ended before it had an answer."""
+
+
 class LatestOnlyWorker(Generic[R]):
     """Makes calls in another process, one at a time; of those that wait for their turn only the newest is made.
 
@@ -129,30 +137,73 @@ class LatestOnlyWorker(Generic[R]):
             if self._closed:
                 return None
             self._process = self._process or _begun()
-            coming = self._process.apply_async(self._function, arguments)
-        found: R = coming.get()
-        return found
+            process, pipe = self._process
+        try:
+            pipe.send((self._function, arguments))
+            found, error = pipe.recv()
+        except (EOFError, OSError):
+            with self._of_process:
+                process.join()
+                self._process = None
+                is_closed = bool(self._closed)
+            if is_closed:
+                return None
+            raise WorkerDiedError(f"the process that was to compute it ended with {process.exitcode}") from None
+        if error is not None:
+            raise error
+        result: R = found
+        return result
 
     def close(self) -> None:
         """End the other process, whatever it is at; no other begins."""
         with self._of_process:
             self._closed = True
             if self._process is not None:
-                self._process.terminate()
+                self._process[0].terminate()
         with self._changed:
             self._changed.notify_all()
 
 
-def _begun() -> Any:
-    """A pool of one process.
+def _begun() -> tuple[Any, Any]:
+    """A process, and the pipe by which it is told what to compute.
 
     Ctrl-C reaches every process of a terminal, and is the page's own to act upon: a process inherits what is blocked
     when it begins. It is spawned, since the server has threads; multiprocessing's own tracker, which would come up with
     it and take the block away, comes first.
     """
     resource_tracker.ensure_running()
+    spawn = multiprocessing.get_context("spawn")
+    ours, theirs = spawn.Pipe()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return multiprocessing.get_context("spawn").Pool(1, os.nice, (_NICE,))
+        process = spawn.Process(target=_compute_what_comes, args=(theirs,), daemon=True)
+        process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()
+    return process, ours
+
+
+def _compute_what_comes(pipe: Any) -> None:
+    """Body of the other process: it ends with the one that began it, in the midst of a computation, too."""
+    os.nice(_NICE)
+    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    while True:
+        try:
+            function, arguments = pipe.recv()
+        except EOFError:
+            return
+        answer: tuple[Any, Exception | None]
+        try:
+            answer = function(*arguments), None
+        except Exception as error:
+            answer = None, error
+        pipe.send(answer)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.link.channel_study import ChannelStudy
+from agv_analysis.output_file import output_file
 from agv_ros.errors import UserError
 
 DRAWN = 1000
@@ -25,7 +26,7 @@ def write_csv(path: Path, found: ChannelStudy) -> None:
     expected = found.expected_age_shares
     closed = [""] * len(counts) if expected is None else expected.tolist()
     try:
-        with open(path, "w", encoding="utf-8", newline="") as file:
+        with open(output_file(path), "w", encoding="utf-8", newline="") as file:
             rows = csv.writer(file)
             rows.writerow(COLUMNS)
             rows.writerows(zip(range(len(counts)), counts, found.age_shares.tolist(), closed, strict=True))
@@ -54,6 +55,6 @@ def draw(path: Path, found: ChannelStudy) -> None:
     shares.set(yscale="log", xlabel="n_ul [slots]", ylabel="share of slots", title="Age of information")
     shares.legend(loc="best", fontsize="small")
     try:
-        figure.savefig(path, dpi=130)
+        figure.savefig(output_file(path), dpi=130)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn to: {error}") from None

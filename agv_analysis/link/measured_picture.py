@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.link.link_figures import LinkFigures
+from agv_analysis.output_file import output_file
 from agv_ros.errors import UserError
 
 _MOST_POINTS = 20_000
@@ -56,6 +57,6 @@ def draw_link(path: Path, found: LinkFigures) -> None:
         delays.legend(loc="upper right", fontsize="small")
     delays.set(xlabel="delay [ms]", ylabel="share of packets at least as late", title="Delay")
     try:
-        figure.savefig(path, dpi=130)
+        figure.savefig(output_file(path), dpi=130)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn to: {error}") from None

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agv_analysis.link.measurement import LOST, RECEIVED, Measurement, PacketOutcomes
+from agv_analysis.output_file import output_file
 from agv_analysis.run import Floats
 from agv_plant.channels.timed_trace import read_trace
 from agv_ros.errors import UserError
@@ -135,7 +136,7 @@ def write_trace(path: Path, link: LinkOfLoop) -> None:
             columns.append(("downlink_delay", "%.9g"))
     form = ",".join(how for _, how in columns)
     try:
-        with open(path, "w", encoding="utf-8") as file:
+        with open(output_file(path), "w", encoding="utf-8") as file:
             file.write(",".join(name for name, _ in columns) + "\n")
             for first in range(0, len(link.time), _ROWS):
                 rows = _rows(link, slice(first, first + _ROWS), [name for name, _ in columns])

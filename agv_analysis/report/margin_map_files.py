@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 from agv_analysis.corridor.corridor_map import TITLES
+from agv_analysis.output_file import output_file
 from agv_analysis.stability.margin_map import MarginMap, map_columns
 from agv_ros.errors import UserError
 
@@ -13,7 +14,7 @@ from agv_ros.errors import UserError
 def write_csv(path: Path, found: MarginMap) -> None:
     """One row a point: the two axes and the margins. Raises UserError if the file cannot be written."""
     try:
-        with path.open("w", encoding="utf-8", newline="") as file:
+        with output_file(path).open("w", encoding="utf-8", newline="") as file:
             rows = csv.writer(file, lineterminator="\n")
             rows.writerow([*found.axes, *found.margins])
             for i, x in enumerate(found.first.tolist()):
@@ -41,6 +42,6 @@ def draw(path: Path, found: MarginMap) -> None:
             scale("log" if values.min() > 0.0 and values.max() >= 10.0 * values.min() else "linear")
         figure.colorbar(mesh, ax=axes)
     try:
-        figure.savefig(path, dpi=150)
+        figure.savefig(output_file(path), dpi=150)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn: {error}") from None

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agv_analysis.output_file import output_file
 from agv_analysis.report.panels import (
     BARS,
     DRIVEN,
@@ -57,7 +58,7 @@ def draw_figures(panels: Iterable[Panel], folder: Path) -> list[Path]:
                 draw_panel(figure.add_subplot(), panel)
                 for suffix, metadata in (("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
                     drawn.append(folder / f"{panel.key}.{suffix}")
-                    figure.savefig(drawn[-1], metadata=metadata)
+                    figure.savefig(output_file(drawn[-1]), metadata=metadata)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written to: {error.strerror or error}") from None
     return drawn

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
+from agv_analysis.output_file import output_file
 from agv_analysis.report.corridor_panels import corridor_panel, edges
 from agv_analysis.report.panels import TIME, Panel, panels, to_json
 from agv_analysis.report.plotly import MOST_POINTS, figure
@@ -45,7 +46,7 @@ def write_report(analysis: Observations, path: str | Path, within: CorridorOfRun
 def write_page(html: str, path: Path) -> None:
     """Write a page. Raises UserError if that is not possible."""
     try:
-        path.write_text(html, encoding="utf-8", errors="backslashreplace")
+        output_file(path).write_text(html, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 

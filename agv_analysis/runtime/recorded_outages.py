@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.output_file import output_file
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
@@ -31,7 +32,7 @@ def write_outages(path: Path, run: Run, downlink: bool = False) -> int:
 
 
 def _write(path: Path, lost: NDArray[np.bool_]) -> None:
-    with open(path, "w", encoding="utf-8", newline="") as file:
+    with open(output_file(path), "w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(("k", "lost"))
         rows.writerows(enumerate(lost.astype(int).tolist()))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from agv_analysis.output_file import output_file
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.plan import Axis, Sweep, SweepError
 
@@ -35,7 +36,7 @@ def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path) -> N
         figure.colorbar(_heat_map(axes, sweep, rows, metric), label=_title(metric))
     axes.set_title(f"{_title(metric)}, {max(row['runs'] for row in rows)} seeds a point", fontsize="medium")
     try:
-        figure.savefig(path, dpi=130)
+        figure.savefig(output_file(path), dpi=130)
     except (OSError, ValueError) as error:
         raise SweepError(f"{path}: cannot be drawn to: {error}") from None
 

@@ -7,6 +7,7 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+from agv_analysis.output_file import output_file
 from agv_analysis.sweep.plan import SweepError
 
 
@@ -16,7 +17,7 @@ def write_rows(rows: list[dict[str, Any]], path: Path) -> None:
         if path.suffix == ".parquet":
             _write_parquet(rows, path)
         else:
-            with open(path, "w", encoding="utf-8", newline="") as file:
+            with open(output_file(path), "w", encoding="utf-8", newline="") as file:
                 writer = csv.DictWriter(file, list(rows[0]))
                 writer.writeheader()
                 writer.writerows(rows)

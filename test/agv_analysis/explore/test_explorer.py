@@ -10,11 +10,14 @@ import os
 import re
 import signal
 import socket
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from http.client import HTTPException
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.error import HTTPError
+from urllib.parse import urlsplit
 from urllib.request import Request, urlopen
 
 import numpy as np
@@ -478,33 +481,112 @@ def test_the_command_says_where_the_page_is_and_ends_on_ctrl_c(start: Start) -> 
     assert (status, "Traceback" in said) == (0, False), said
 
 
-def ask_for_the_lap(address: str, base: Scenario) -> None:
-    """What the page asks for after a move; the server may go away meanwhile."""
+def question(base: Scenario, output: str, changed: str, **moved: Any) -> dict[str, Any]:
+    """What the page sends for a callback with these outputs, after it was moved."""
     from agv_analysis.explore.app import KEYS
 
-    values = values_of(base)
+    values = {**values_of(base), **moved}
     state = [{"id": key, "property": "value", "value": values[key]} for key in KEYS]
     state.append({"id": "pinned", "property": "data", "value": None})
-    inputs = [{"id": "problem", "property": "children", "value": ""}]
+    more = [{"id": "again", "property": "n_intervals", "value": 0}] if changed == "kx.value" else []
+    inputs = [{"id": "problem", "property": "children", "value": ""}] if changed == "problem.children" else state + more
+    names = output.strip(".").split("...")
+    outputs = [dict(zip(("id", "property"), name.split(".", 1), strict=True)) for name in names]
+    return {
+        "output": output, "outputs": outputs, "inputs": inputs, "changedPropIds": [changed],
+        "state": state if changed == "problem.children" else [],
+    }  # fmt: skip
+
+
+def output_of(address: str, source: str) -> str:
+    """The outputs of the callback that a part of the page feeds first."""
     with urlopen(f"{address}_dash-dependencies") as respond:
-        [output] = [
-            one["output"] for one in json.load(respond) if one["inputs"] == [{"id": "problem", "property": "children"}]
-        ]
-    outputs = [
-        dict(zip(("id", "property"), name.split(".", 1), strict=True)) for name in output.strip(".").split("...")
-    ]
-    asked = {
-        "output": output,
-        "outputs": outputs,
-        "inputs": inputs,
-        "state": state,
-        "changedPropIds": ["problem.children"],
-    }
-    request = Request(
-        f"{address}_dash-update-component", json.dumps(asked).encode(), {"Content-Type": "application/json"}
-    )
+        found: list[str] = [one["output"] for one in json.load(respond) if source in f"{one['inputs'][0]}"]
+    return found[0]
+
+
+def ask(address: str, content: object, **headers: str) -> tuple[int, str]:
+    """Status and text of the answer to a request for an update."""
+    data = content if isinstance(content, bytes) else json.dumps(content).encode()
+    request = Request(f"{address}_dash-update-component", data, {"Content-Type": "application/json", **headers})
+    try:
+        with urlopen(request, timeout=300.0) as answer:
+            return answer.status, answer.read().decode()
+    except HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def ask_for_the_lap(address: str, base: Scenario) -> tuple[int, str]:
+    """What the page asks for after a move."""
+    return ask(address, question(base, output_of(address, "'problem'"), "problem.children"))
+
+
+def try_to_ask_for_the_lap(address: str, base: Scenario) -> None:
+    """The server may go away meanwhile."""
     with contextlib.suppress(OSError, HTTPException):
-        urlopen(request, timeout=300.0).close()
+        ask_for_the_lap(address, base)
+
+
+def test_only_its_own_page_is_answered_and_no_file_from_elsewhere_is_read(
+    start: Start, base: Scenario, tmp_path: Path
+) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    served = start("agv_analysis.cli", "explore", "config/outages.yaml", "--port", "0", "--no-browser")
+    address = served.wait_for("explore:").split()[1]
+    port = urlsplit(address).port
+    root = f"http://127.0.0.1:{port}/"
+    output = output_of(address, "'kx'")
+
+    def moved(**values: Any) -> dict[str, Any]:
+        return question(base, output, "kx.value", **values)
+
+    assert len(address) > len(root) + 20
+    assert ask(address, moved())[0] == 200
+    assert ask(address, moved(), Host="evil.example")[0] == 403
+    assert ask(address, moved(), Host=f"evil.example:{port}")[0] == 403
+    assert ask(address, moved(), Origin="http://evil.example")[0] == 403
+    assert ask(address, moved(), Origin="null")[0] == 403
+    assert ask(address, moved(), Origin=root.rstrip("/"))[0] == 200
+    assert ask(root, moved())[0] in (404, 405)  # without the secret
+    assert ask(address, b" " * (2**20 + 1))[0] == 413
+    secret = tmp_path / "secret.csv"
+    secret.write_text("root:x:0:0\n")
+    for setting in ("relay.uplink.trace_file", "error_detector.track_file"):
+        model = "relay.uplink.model=trace" if "relay" in setting else "error_detector.track=csv"
+        status, text = ask(address, moved(more=f"{model}\n{setting}={secret}"))
+        assert (status, "where the page was started" in text, "root:x" in text) == (200, True, False)
+        status, text = ask(address, moved(more=f"{model}\n{setting}=README.md"))
+        assert (status, "`agv-ncs simulate` says why" in text, "agv_ncs" in text) == (200, True, False)
+    assert "500000 steps at most" in ask(address, moved(more="plant.duration=1e5"))[1]
+    malformed = [b"{", b"[]", b"null", {"output": 5}, moved(kx="much"), moved(kx=None), moved(more=7)]
+    assert [ask(address, content)[0] for content in malformed] == [400] * len(malformed)
+    assert ask(address, moved())[0] == 200
+
+
+def test_a_helper_that_dies_is_started_again_and_ends_with_the_server(start: Start, base: Scenario) -> None:
+    pytest.importorskip("dash", reason="needs Dash: pip install '.[explore]'")
+    served = start("agv_analysis.cli", "explore", "config/outages.yaml", "--port", "0", "--no-browser")
+    address = served.wait_for("explore:").split()[1]
+
+    def helpers() -> list[Path]:
+        return [child for child in served.children() if b"spawn_main" in (child / "cmdline").read_bytes()]
+
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(ask_for_the_lap, address, base)
+        served.until(lambda: bool(helpers()))
+        [first] = helpers()
+        os.kill(int(first.name), signal.SIGKILL)
+        status, text = asked.result(300.0)
+        assert (status, "the next move starts another" in text) == (200, True)
+        threads.submit(try_to_ask_for_the_lap, address, base)
+        served.until(lambda: bool(helpers()))
+        [second] = helpers()
+        served.process.kill()
+    assert second != first
+    deadline = time.monotonic() + 60.0
+    while second.exists() and "Z" not in (second / "stat").read_text().rpartition(")")[2]:
+        assert time.monotonic() < deadline
+        os.sched_yield()
 
 
 def test_ctrl_c_ends_it_in_the_midst_of_the_lap_s_criteria(start: Start, base: Scenario) -> None:
@@ -513,7 +595,7 @@ def test_ctrl_c_ends_it_in_the_midst_of_the_lap_s_criteria(start: Start, base: S
     served = start(*command, start_new_session=True)
     address = served.wait_for("explore:").split()[1]
     with ThreadPoolExecutor(1) as threads:
-        threads.submit(ask_for_the_lap, address, base)
+        threads.submit(try_to_ask_for_the_lap, address, base)
         served.until(lambda: bool(served.children()))
         os.killpg(served.process.pid, signal.SIGINT)  # as a terminal does
         status, said = served.end()
