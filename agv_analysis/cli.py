@@ -35,6 +35,10 @@ class _Group(click.Group):
 
         try:
             return super().invoke(ctx)
+        except OSError as error:  # of a path that no one has thought of, as one that is too long
+            if error.filename is None:
+                raise
+            raise click.ClickException(printable(f"{error.filename}: {error.strerror}")) from None
         except UserError as error:
             raise click.ClickException(printable(str(error))) from None
 

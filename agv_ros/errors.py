@@ -48,5 +48,7 @@ def open_text(
             yield file
     except OSError as error:
         raise kind(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
+    except ValueError as error:
+        if not isinstance(error, UnicodeDecodeError):  # a path with a NUL or a surrogate in it
+            raise kind(f"{path!r}: is no name of a file: {error}") from None
         raise kind(f"{path}: is not UTF-8 text: {error.reason} at byte {error.start}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_plant.radio.channel import check_length
 from agv_ros.errors import UserError
+from agv_ros.stamps import LATEST_NS, NS_PER_S
 
 PATIENCE = 15.0
 """How long [s] a run that is interrupted waits for its recorder, if there is one that lags: nothing shall be lost.
@@ -30,6 +32,12 @@ def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
         raise UserError(
             "error_detector.trigger is timer, but plant.clock is lockstep, in which the plant waits for an answer to "
             "each of its steps: set plant.clock=realtime"
+        )
+    end = scenario.plant.start_time + scenario.plant.duration
+    if math.isfinite(end) and end * NS_PER_S > LATEST_NS:
+        raise UserError(
+            f"plant.start_time + plant.duration is {end:g} s, and a stamp of ROS ends at {LATEST_NS / NS_PER_S:.0f} s: "
+            "shorten plant.duration, or set it to .inf"
         )
     steps = scenario.plant.duration / scenario.plant.ts
     relay = scenario.relay

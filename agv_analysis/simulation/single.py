@@ -30,6 +30,10 @@ from agv_ros.substitution import Replacements
 _PAPERS_VEHICLE = vehicle_parameters(PlantParameters())
 
 
+MOST_STEPS = 20_000_000
+"""Steps of a run that is kept in memory, 300 bytes each: 28 hours at 5 ms."""
+
+
 def simulate(scenario: Scenario) -> Run:
     """The run of a scenario in lockstep, as a recording of the nodes would give it.
 
@@ -37,6 +41,11 @@ def simulate(scenario: Scenario) -> Run:
     or a policy raises or returns NaN. A loop that diverges ends there, and its run says so in its notes.
     """
     steps, relay, plant = steps_of(scenario), scenario.relay, scenario.plant
+    if steps > MOST_STEPS:
+        raise UserError(
+            f"plant.duration / plant.ts is {steps:.6g} steps, and a run of more than {MOST_STEPS} does not go into "
+            "memory: shorten plant.duration"
+        )
     reference = reference_of(scenario.error_detector, steps + scenario.controller.steps_ahead).copy()
     up, down = (
         SimulatedLink(channel, relay.seed, name, steps, plant.ts)

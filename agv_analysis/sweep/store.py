@@ -13,6 +13,7 @@ from agv_analysis.simulation import STATISTICS
 from agv_analysis.simulation.batch import Table
 from agv_analysis.sweep.plan import Part, Sweep, SweepError
 from agv_analysis.version import version
+from agv_ros.json_text import parse_json
 
 
 class Store:
@@ -88,7 +89,9 @@ def _make(folder: Path, parts: Path, about: Path, description: dict[str, Any]) -
 def _compare(about: Path, description: dict[str, Any]) -> None:
     """Raise SweepError if the sweep that is on disk is another one."""
     try:
-        found = json.loads(about.read_text(encoding="utf-8"))
+        found = parse_json(about.read_bytes())
+        if not isinstance(found, dict):
+            raise ValueError("it holds no object")  # as what is no JSON
     except (OSError, ValueError) as error:
         raise SweepError(f"{about}: cannot be read: {error}") from None
     wanted = json.loads(json.dumps(description))

@@ -37,6 +37,10 @@ class SpeedProfile:
         return v0 + share * (v1 - v0), w0 + share * (w1 - w0)
 
 
+MOST_ROWS = 1_000_000
+"""Rows of a track: three hours at 10 ms."""
+
+
 def parse_track(lines: Iterable[str], name: str) -> SpeedProfile:
     """Speed profile from the lines of a CSV file called `name` in messages.
 
@@ -53,6 +57,8 @@ def parse_track(lines: Iterable[str], name: str) -> SpeedProfile:
         columns = [header.index(column) for column in ("t", "v", "w")]
         rows: list[tuple[float, float, float]] = []
         for row in reader:
+            if len(rows) > MOST_ROWS:
+                raise TrackFileError(f"{name}: has more than {MOST_ROWS} rows: leave out some, speeds are interpolated")
             if row:
                 rows.append(_row(row, columns, f"{name}:{reader.line_num}", rows))
     except csv.Error as error:

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from agv_plant.channels.trace import TraceError, load_trace
 from agv_ros.errors import open_text
+from agv_ros.json_text import parse_json
 
 Floats = NDArray[np.float64]
 
@@ -189,7 +190,7 @@ def _from_json(path: str, link: str) -> Trace:
     with open_text(path, TraceError, encoding="utf-8-sig") as file:
         text = file.read()
     try:
-        content = json.loads(text)
+        content = parse_json(text)
     except json.JSONDecodeError:
         content = None
     if not isinstance(content, dict) or not isinstance(content.get(TIME), list):

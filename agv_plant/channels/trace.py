@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from agv_ros.errors import UserError, open_text
+from agv_ros.json_text import parse_json
 
 ENDS = ("repeat", "hold", "stop")
 """What follows the last outcome: the first one again, deliveries for ever, or an error."""
@@ -79,7 +80,7 @@ def parse_json_trace(text: str, name: str) -> tuple[bool, ...]:
     members are passed over. Raises TraceError naming the line of broken JSON, or the element.
     """
     try:
-        content = json.loads(text)
+        content = parse_json(text)
     except json.JSONDecodeError as error:
         raise TraceError(f"{name}:{error.lineno}: {error.msg}") from None
     named = [column for column in _WORDS if column in content] if isinstance(content, dict) else []

@@ -40,6 +40,10 @@ class Entry(NamedTuple):
     outage: Outage
 
 
+_LATEST = 1e9
+"""Latest time [s] of an entry, and longest outage: 31 years."""
+
+
 def parse_schedule(text: str, changeable: Mapping[str, Parameter]) -> tuple[Entry, ...]:
     """Entries of a schedule, by time; those of one time in the order of the text.
 
@@ -55,10 +59,12 @@ def _entry(text: str, changeable: Mapping[str, Parameter]) -> Entry:
     if found is None:
         raise ParameterError(f"schedule: must be {_FORM}; got {text!r}")
     at, name, value, period = float(found[1] or 0.0), found[2], float(found[3]), float(found[4] or 0.0)
-    if at < 0.0:
-        raise ParameterError(f"schedule: a time must be >= 0 s, got {text!r}")
+    if not 0.0 <= at <= _LATEST:
+        raise ParameterError(f"schedule: a time must be in [0, {_LATEST:g}] s, got {text!r}")
     if name == OUTAGE:
-        if value < 0.0 or (found[4] is not None and not 0.0 < value <= period):
+        if not 0.0 <= value <= _LATEST or not period <= _LATEST:
+            raise ParameterError(f"schedule: an outage and its period must be in [0, {_LATEST:g}] s, got {text!r}")
+        if found[4] is not None and not 0.0 < value <= period:
             raise ParameterError(f"schedule: an outage must be >= 0 s and no longer than its period, got {text!r}")
         return Entry(at, name, 0.0, Outage(at, value, period))
     if name not in changeable:

@@ -6,7 +6,6 @@ either only the sums at the end are the receiver's. Source: iperf3(1).
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.text_columns import open_binary
 from agv_analysis.link.measurement import LossRates, MeasurementError
+from agv_ros.json_text import parse_json
 
 Row = tuple[float, float, int, int]
 
@@ -26,7 +26,7 @@ def _matches(head: bytes, path: Path) -> bool:
 def _read(path: Path, options: Options) -> LossRates:
     with open_binary(path) as file:
         try:
-            content = json.load(file)
+            content = parse_json(file.read())
         except (ValueError, OSError) as error:
             raise MeasurementError(f"{path}: is no whole JSON file: {error}") from None
     if not isinstance(content, dict):

@@ -158,7 +158,7 @@ def _members(batch: bytes) -> Iterator[Any]:
         try:
             member, at = decoder.raw_decode(text, at)
             yield member
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):  # no JSON, a number of thousands of digits, or nested too deeply
             following = _NEXT.search(text, at + 1)
             end = len(text) if following is None else following.start(1)
             yield text[at:end].encode()

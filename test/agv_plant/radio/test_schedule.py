@@ -122,7 +122,7 @@ def test_what_changes_has_no_closed_form() -> None:
         ("20: seed=1", "'seed' must be one of outage"),
         ("20: p=1.5", r"schedule.p must be in \[0, 1\], got 1.5"),
         ("20: n=1.5", "schedule.n is an integer, got 1.5"),
-        ("-1: p=0.1", "a time must be >= 0 s, got '-1: p=0.1'"),
+        ("-1: p=0.1", "a time must be in \\[0, 1e\\+09\\] s, got '-1: p=0.1'"),
         ("20: outage=6 every 5", "an outage must be >= 0 s and no longer than its period, got '20: outage=6 every 5'"),
         ("20: outage=0 every 5", "no longer than its period"),
         ("20: p=0.1 every 5", "only an outage comes again"),
