@@ -50,6 +50,10 @@ _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_v
 """A topic that each peer publishes, in the order in which a step passes them."""
 
 
+_ONCE = (("agv/pose", "plant"), *_PEERS, ("agv/slot", "relay"), ("agv/cmd_vel", "relay"))
+"""What one node alone publishes, or else two loops have become one."""
+
+
 def progress_line(k: int, steps: float) -> str:
     """What the plant logs of its progress."""
     return f"step {k} of {steps}"
@@ -111,8 +115,8 @@ class PlantNode(LoopNode[PlantParameters]):
         wanted = max(self.settings.wait_for_subscribers, self._lockstep)
         if not all(output.is_heard(wanted) for output in self.outputs):
             return False
-        if self.count_publishers("agv/pose") > 1:
-            self.fail(f"another plant publishes {self._pose_out.topic}: use another namespace or ROS_DOMAIN_ID")
+        if rivals := [f"another {node} publishes {topic}" for topic, node in _ONCE if self.count_publishers(topic) > 1]:
+            self.fail(f"{', '.join(rivals)}: use another namespace or ROS_DOMAIN_ID")
         elif self._lockstep:
             self._publish()
         else:
@@ -188,6 +192,7 @@ class PlantNode(LoopNode[PlantParameters]):
 
     def _take(self, command: Command) -> None:
         if self._lockstep:
+            self._refuse_later(command.stamp_ns)
             self._answer(self._join.add_message(command))
         else:
             self._held.offer(command)
@@ -195,7 +200,15 @@ class PlantNode(LoopNode[PlantParameters]):
     def _on_slot(self, data: bytes) -> None:
         slot = decode_slot(data)
         if self._lockstep:
+            self._refuse_later(slot.stamp_ns)
             self._answer(self._join.add_slot(slot))
+
+    def _refuse_later(self, stamp_ns: int) -> None:
+        """Raise InvalidMessageError for an answer to a step that has not been asked for."""
+        if self._pose_out.count and stamp_ns > self.grid.stamp(self.k):
+            raise InvalidMessageError(
+                f"answers a step after {self.k}, which has not been asked for: who else sends it?"
+            )
 
     # -- lockstep ----------------------------------------------------------------------------------------------------
 

@@ -45,6 +45,9 @@ LOOP_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
 
+_LOOK_PERIOD = 1.0
+"""How often [s] a node looks for others that publish its topics."""
+
 _ACK_PERIOD = 0.1
 """For how long [s] at a time a node waits until its subscribers have acknowledged what it has sent."""
 
@@ -58,9 +61,10 @@ ENDED = "ended"
 class Output:
     """A publisher of serialised messages that counts them."""
 
-    def __init__(self, publisher: Publisher, side: bool) -> None:
+    def __init__(self, publisher: Publisher, side: bool, where: Node) -> None:
         self._publisher = publisher
         self._side = side
+        self._where = where
         self.count = 0
         self.topic: str = publisher.topic_name
 
@@ -72,6 +76,17 @@ class Output:
     def is_heard(self, subscribers: int) -> bool:
         """Has the topic this many subscribers? One fewer is enough beside the loop: only a recorder listens there."""
         return bool(self._publisher.get_subscription_count() >= subscribers - self._side)
+
+    def rivals(self) -> list[str]:
+        """Names of other nodes that publish what one node of a loop alone should; none beside the loop."""
+        if self._side or self._where.count_publishers(self.topic) <= 1:
+            return []
+        infos = self._where.get_publishers_info_by_topic(self.topic)
+        others = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos]
+        own = self._where.get_fully_qualified_name()
+        if own in others:  # one of them is this node
+            others.remove(own)
+        return sorted(others)
 
     def flush(self, seconds: float) -> bool:
         """Wait until every subscriber has what was sent, `seconds` at most; do they have it?"""
@@ -106,7 +121,10 @@ class LoopNode(Node, Generic[P]):
         self.sides: list[Node] = []
         """This node's participants in other DDS domains; to be spun with it."""
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
+        self._rivals: dict[str, str] = {}
+        """Other publishers of this node's topics, as they were seen, by topic."""
         self.add_on_set_parameters_callback(self._on_set_parameters)
+        self.create_timer(_LOOK_PERIOD, self._look_for_rivals, clock=self._steady)
 
     # -- domains -----------------------------------------------------------------------------------------------------
 
@@ -144,7 +162,7 @@ class LoopNode(Node, Generic[P]):
         publisher = (on or self).create_publisher(
             kind, topic, copy(LOOP_QOS), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
-        self.outputs.append(Output(publisher, side))
+        self.outputs.append(Output(publisher, side, on or self))
         return self.outputs[-1]
 
     def input(
@@ -216,6 +234,18 @@ class LoopNode(Node, Generic[P]):
 
     # -- what went wrong ---------------------------------------------------------------------------------------------
 
+    def _look_for_rivals(self) -> None:
+        """Name, once each, other nodes that publish this node's topics: what they send counts as this loop's."""
+        for output in self.outputs:
+            names = ", ".join(output.rivals())
+            if names and names != self._rivals.get(output.topic):
+                self._rivals[output.topic] = names
+                self.get_logger().warning(
+                    f"{names} also publishes {output.topic}, and what it sends counts as this loop's: use another "
+                    "namespace or ROS_DOMAIN_ID"
+                )
+                self.report(self._last_ns)
+
     def reject(self, topic: str, error: Exception) -> None:
         """Count a message that must not enter the loop; the first of its topic is logged."""
         self.rejected[topic] += 1
@@ -271,6 +301,7 @@ class LoopNode(Node, Generic[P]):
         facts = self.facts() | {f"{PUBLISHED}{topic}": str(count) for topic, count in published.items()}
         facts |= self._changes
         facts |= {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
+        facts |= {f"other publishers {topic}": names for topic, names in self._rivals.items()}
         facts |= {f"errors {kind}": str(count) for kind, count in sorted(self.survived.items())}
         if self._ended:
             facts |= {ENDED: "true"}

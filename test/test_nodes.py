@@ -332,6 +332,49 @@ def test_a_parameter_of_no_known_type_does_not_end_a_node(bench: Bench) -> None:
     assert set_parameter(bench, "controller", "kx", 7.5).successful
 
 
+def test_another_publisher_of_a_node_s_topic_is_named(bench: Bench) -> None:
+    bench.add(RelayNode)
+    diagnostics = bench.received(DiagnosticArray, "/diagnostics")
+    bench.probe.create_publisher(TimeReference, "edge/slot", LOOP_QOS)
+
+    def said() -> set[str]:
+        values = (value for message in diagnostics for status in message.status for value in status.values)
+        return {value.value for value in values if value.key == "other publishers /edge/slot"}
+
+    bench.until(lambda: said() == {"/probe"})
+
+
+def test_a_plant_does_not_begin_beside_a_second_controller(bench: Bench) -> None:
+    for node in (bench.probe, bench.add(ControllerNode)):
+        node.create_publisher(TwistStamped, "edge/cmd_vel", LOOP_QOS)
+    plant = bench.add(PlantNode, clock="realtime", wait_for_subscribers=1)
+    bench.received(PoseStamped, "agv/pose")
+    bench.until(lambda: plant.finished)
+    assert plant.failure == "another controller publishes edge/cmd_vel: use another namespace or ROS_DOMAIN_ID"
+
+
+def test_in_lockstep_an_answer_to_a_later_step_is_rejected(bench: Bench) -> None:
+    plant = bench.add(PlantNode, initial_pose=[0.0, 0.0, 0.0], duration=0.01)
+    poses = bench.received(PoseStamped, "agv/pose")
+    commands, slots = bench.publisher(TwistStamped, "agv/cmd_vel"), bench.publisher(TimeReference, "agv/slot")
+
+    def answer(k: int) -> None:
+        command, slot = TwistStamped(), TimeReference()
+        command.header.stamp = slot.header.stamp = slot.time_ref = pose(k).header.stamp
+        slot.source = "delivered"
+        commands.publish(command)
+        slots.publish(slot)
+
+    bench.until_count(poses, 1)
+    answer(10)
+    bench.until(lambda: plant.rejected == {"agv/cmd_vel": 1, "agv/slot": 1})
+    for k in range(2):
+        bench.until_count(poses, k + 1)
+        answer(k)
+    bench.until(lambda: plant.finished)
+    assert plant.failure == ""
+
+
 # -- an edge with a clock of its own ----------------------------------------------------------------------------------
 
 

@@ -28,7 +28,7 @@ from agv_ros.params_file import parse_sections
 
 EVENTS = "/parameter_events"
 
-_OF_THE_START = ("wait_for_subscribers", "stop_timeout")
+_OF_THE_START = ("wait_for_subscribers", "stop_timeout", "stamp_window")
 """Parameters that say how nodes come up and end; a runner sets them."""
 
 _OF_A_REPLAY = ("plan_steps", "trigger", "command_type")

@@ -14,6 +14,7 @@ from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_plant.radio.channel import check_length
 from agv_ros.errors import UserError
+from agv_ros.parameters import LoopParameters, parameters_of
 from agv_ros.stamps import LATEST_NS, NS_PER_S
 
 PATIENCE = 15.0
@@ -21,6 +22,10 @@ PATIENCE = 15.0
 
 DDS says only every 3 s that a message is there which a busy reader has missed.
 """
+
+
+_LEAST_WINDOW = parameters_of(LoopParameters)["stamp_window"].low or 0.0
+"""Shortest `stamp_window` [s]."""
 
 
 def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
@@ -44,6 +49,8 @@ def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
     for link, channel in (("uplink", relay.uplink), ("downlink", relay.downlink)):
         check_length(channel, relay.seed, link, steps, relay.ts)
     met = {"wait_for_subscribers": 1 + recorded, "stop_timeout": PATIENCE if recorded else scenario.plant.stop_timeout}
+    if scenario.plant.clock == "lockstep":  # in which each step follows the one before it
+        met["stamp_window"] = max(_LEAST_WINDOW, scenario.plant.ts)
     nodes = {name: dataclasses.replace(getattr(scenario, name), **met) for name in SCHEMAS}
     if scenario.error_detector.hears_commands and not scenario.plant.plan_steps:
         nodes["controller"] = dataclasses.replace(nodes["controller"], wait_for_subscribers=2 + recorded)

@@ -26,6 +26,14 @@ from agv_ros.parameters import LoopParameters
 
 _BLOCK = 4096
 
+_FAR = 4096
+"""So many slots ahead of the last one are not all evaluated on the way, if that can be avoided."""
+
+_BAD = 1
+
+_TWO_STATES = ("perfect", "bernoulli", "burst", "gilbert_elliott")
+"""Models that have no states but GOOD and _BAD."""
+
 
 def own_stream(parameters: ChannelParameters, stream: str) -> str:
     """Name of a vehicle's random numbers on a link; those of the first have the link's own name."""
@@ -194,6 +202,8 @@ class Channel:
             return SlotOutcome(lost, TRACE if lost else "")
         if k < self._next - 1:
             self._next, self._state = 0, GOOD
+        if k - self._next > _FAR:
+            self._skip_to(k)
         while self._next <= k:
             before = self._state
             try:
@@ -205,6 +215,26 @@ class Channel:
             self._last = SlotOutcome(bool(lost), self.parameters.model if lost else "", before)
             self._next += 1
         return self._last
+
+    def _skip_to(self, k: int) -> None:
+        """Go on with slot k, which is far ahead, if the state there can be told without all slots before it.
+
+        Both states are followed from some slots before k on: where they have become one, it is that one, whatever was
+        before (coupling from the past, Propp and Wilson 1996). Without memory that is so in the first of them.
+        """
+        model = self._model
+        if self.parameters.model not in _TWO_STATES or model is None:
+            return
+        length = _FAR
+        while (first := k - length) > self._next:
+            good, bad = GOOD, _BAD
+            for j in range(first, k):
+                channel, u = self._segment(j).channel, self._random.at(j)
+                good, bad = model(channel, j, u, good)[1], model(channel, j, u, bad)[1]
+                if good == bad:
+                    self._next, self._state = j + 1, good
+                    return
+            length *= 4
 
     def _measured_at(self, k: int) -> tuple[float, float]:
         """Lost (0 or 1) and time under way [s] of slot k; those around it are looked up with it.

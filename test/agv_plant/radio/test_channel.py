@@ -70,3 +70,27 @@ def test_changed_parameters_hold_from_the_next_slot_on(model: str) -> None:
     assert channel.lost(99) == first[99]
     # At most the outage that is running is still to end.
     assert not any(channel.lost(k) for k in range(101, 200))
+
+
+@pytest.mark.parametrize(
+    "c",
+    [
+        ChannelParameters(model="gilbert_elliott", p=0.01, r=0.3),
+        ChannelParameters(model="gilbert_elliott", p=0.0005, r=0.001, h=0.2, k=0.9),
+        ChannelParameters(model="gilbert_elliott", p=0.3, r=0.3),  # both states change in the same slots, for ever
+        ChannelParameters(model="gilbert_elliott", p=0.01, r=0.3, schedule="200: p=0.3"),
+        ChannelParameters(model="bernoulli", p=0.3),
+    ],
+)
+def test_a_slot_far_ahead_has_the_outcome_of_the_whole_run(c: ChannelParameters) -> None:
+    outcomes = losses(c, 3, "uplink", 60_000)
+    for first in range(30_000, 60_000, 3_001):
+        channel = Channel(c, 3, "uplink")
+        assert [channel.lost(k) for k in range(first, min(60_000, first + 20))] == outcomes[first : first + 20].tolist()
+
+
+def test_a_slot_hours_ahead_does_not_take_the_slots_before_it() -> None:
+    """A hundred million of them, which would take half an hour."""
+    channel = Channel(ChannelParameters(model="gilbert_elliott", p=0.01, r=0.3), 3, "uplink")
+    assert channel.outcome(10**8).lost in (True, False)
+    assert channel.outcome(5) == Channel(channel.parameters, 3, "uplink").outcome(5)
