@@ -66,7 +66,7 @@ AGREEING = 10
 class Steps:
     """Steps of a running loop: as `Grid.step`, but a wrong stamp cannot send a node far into the future.
 
-    A stamp more than `window` steps after the newest one is refused, unless those before it, one after the other, agree
+    A stamp more than `window` steps after the furthest one is refused, unless those before it, one after the other, agree
     with it: then the messages are right, and the loop has paused or leapt.
     """
 
@@ -83,10 +83,11 @@ class Steps:
         latest = MAX_FIRST if self._last is None else self._last + self._window
         if k > latest and not self._agrees(k):
             raise OffGridError(
-                f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, the last one seen was {self._last}; "
+                f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, the furthest one seen was {self._last}; "
                 f"steps up to {latest} are accepted: do all nodes have the same start_time?"
             )
-        self._last, self._agreeing = k, 0
+        # What comes late, or begins a run anew, does not take the window back: those after it would be beyond it.
+        self._last, self._agreeing = k if self._last is None else max(k, self._last), 0
         return k
 
     def _agrees(self, k: int) -> bool:

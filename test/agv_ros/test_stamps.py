@@ -60,12 +60,19 @@ def test_a_wild_stamp_is_refused_and_changes_nothing() -> None:
     steps = Steps(grid)
     steps.of(grid.stamp(3))
     for wild in (3 + MAX_LEAP + 1, 10**12):
-        with pytest.raises(OffGridError, match=f"is step {wild}, the last one seen was 3"):
+        with pytest.raises(OffGridError, match=f"is step {wild}, the furthest one seen was 3"):
             steps.of(grid.stamp(wild))
     with pytest.raises(OffGridError):
         steps.of(grid.stamp(4) + 1)
     assert steps.of(grid.stamp(3 + MAX_LEAP)) == 3 + MAX_LEAP
     assert steps.of(grid.stamp(4)) == 4
+
+
+def test_a_stamp_of_the_past_does_not_shut_out_the_present() -> None:
+    grid = Grid(10**9, 5_000_000)
+    steps = Steps(grid, window=2)
+    for k in (0, 1, 2, 3, 4, 5, 6, 7, 1, 8, 0, 9):
+        assert steps.of(grid.stamp(k)) == k
 
 
 def test_a_loop_that_has_leapt_is_followed_once_enough_messages_agree() -> None:
