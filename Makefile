@@ -10,7 +10,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test coverage bench fuzz docs sample clean
+.PHONY: demo test coverage bench fuzz torture docs sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -31,6 +31,9 @@ bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
 
 fuzz: $(VENV)/test.stamp ## damaged bags against independent readers, a million over night; CASES=1000 for fewer
 	nice $(BIN)/python -m fuzz --cases $(or $(CASES),1000000) --json fuzz.json --save fuzz_failures
+
+torture: $(VENV)/test.stamp ## signals to every process of a run, wild messages, damaged bags; MINUTES=20
+	$(BIN)/python -m torture --minutes $(or $(MINUTES),20) --json torture.json
 
 docs: $(VENV)/run.stamp ## bring README.md and docs/ up to date with the code
 	$(BIN)/python docs/update.py

@@ -11,8 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+"""Environment variable of ROS 2: which participants find each other."""
+
 # The loop is one machine's business unless its user says otherwise; set before rclpy makes its first participant.
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault(DISCOVERY_RANGE, "LOCALHOST")
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -121,6 +124,16 @@ def add(executor: Executor, node: LoopNode[Any]) -> None:
         executor.add_node(side)
 
 
+def discovery_note() -> str:
+    """Who can find the nodes of this process, and how to change that."""
+    range_ = os.environ[DISCOVERY_RANGE]
+    whom = {
+        "LOCALHOST": "this host alone finds the loop", "OFF": "no other process finds the loop",
+        "SUBNET": "every host of the network finds the loop and can send it messages",
+    }.get(range_, "the middleware's own default holds")  # fmt: skip
+    return f"discovery: {DISCOVERY_RANGE}={range_}, {whom}"
+
+
 def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = None) -> None:
     """Body of a node's `main`: make it, run it until it ends or is stopped, and exit with its status.
 
@@ -142,6 +155,7 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
         node = make()
     except UserError as error:
         return str(error)
+    node.get_logger().info(discovery_note())
     executor = EventsExecutor()
     add(executor, node)
     spin(executor, lambda: node.finished or stop.requested)

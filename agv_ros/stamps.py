@@ -66,8 +66,8 @@ AGREEING = 10
 class Steps:
     """Steps of a running loop: as `Grid.step`, but a wrong stamp cannot send a node far into the future.
 
-    A stamp more than `window` steps after the furthest one is refused, unless those before it, one after the other, agree
-    with it: then the messages are right, and the loop has paused or leapt.
+    A stamp more than `window` steps after the furthest one is refused, unless those before it, one after the other,
+    agree with it: then the messages are right, and the loop has paused or leapt.
     """
 
     def __init__(self, grid: Grid, window: int = MAX_LEAP) -> None:

@@ -34,9 +34,9 @@ def main(minutes: float, seed: int, json_file: Path | None) -> None:
     for name, part in (("kills", _kills), ("wire", _wire), ("bags", _bags)):
         with tempfile.TemporaryDirectory(prefix="agv_ncs_torture_") as folder:
             found[name] = part(seed, time.monotonic() + 60.0 * minutes * _SHARES[name], Path(folder))
+        if json_file is not None:
+            json_file.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
         click.echo(f"{name}: {found[name]['cases']} cases, {found[name]['bad']} of them not as they should be")
-    if json_file is not None:
-        json_file.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
     raise SystemExit(any(part["bad"] for part in found.values()))
 
 
@@ -81,7 +81,7 @@ def _bags(seed: int, end: float, folder: Path) -> dict[str, Any]:
     bad: Counter[str] = Counter()
     while time.monotonic() < end:
         found = fuzz(seed, range(cases_done, cases_done + 200), folder, None)
-        cases_done += found.cases
+        cases_done += sum(found.cases.values())
         bad.update(found.faults)
     return {"cases": cases_done, "bad": sum(bad.values()), "faults": dict(bad)}
 

@@ -78,7 +78,9 @@ def command(
         from agv_analysis.runtime.run_setup import OnDisk
         from agv_analysis.runtime.runner import run_in_process
     from agv_analysis.commands.progress import step_bar
+    from agv_ros.executor import discovery_note
 
+    click.echo(discovery_note(), err=True)
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
         run = run_in_processes if processes else run_in_process
         outcome = run(scenario, bag, progress, on_disk=OnDisk(fsync, if_unwritable))
