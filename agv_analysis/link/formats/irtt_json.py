@@ -238,7 +238,7 @@ def _decoder() -> Callable[[bytes], list[Trip] | None]:
 def _decode_as_json(batch: bytes) -> list[Trip] | None:
     try:
         found = [_trip(member) for member in json.loads(b"[" + batch.strip(b" \t\r\n,") + b"]")]
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return None if None in found else found  # type: ignore[return-value]
 
