@@ -39,6 +39,7 @@ setup(
         "mcap>=1.6",
         "numba>=0.57",
         "numpy>=1.23",
+        "packaging>=22.0",
         "plotly>=6.0",
         "pyyaml>=6.0",
         "rich>=12.0",

@@ -22,7 +22,8 @@ ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|(rosidl|ament|rmw|rosbag2|tf2|lau
 
 SPEAK_ROS = {
     "agv_ros.node", "agv_ros.executor",
-    "agv_analysis.runtime.one_process", "agv_analysis.runtime.runner", "agv_analysis.runtime.processes",
+    "agv_analysis.runtime.middleware", "agv_analysis.runtime.one_process", "agv_analysis.runtime.runner",
+    "agv_analysis.runtime.processes",
 }  # fmt: skip
 """Beside the nodes themselves."""
 

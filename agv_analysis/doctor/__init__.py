@@ -1,0 +1,1 @@
+"""What of this machine matters to the loop: versions, middleware, clocks, cores, leftovers, and a timed loop."""
