@@ -153,14 +153,15 @@ def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tub
     attempt = int(0.99 * longest) if longest > LONG else longest
     while outside - inside > max(1, inside // 50):
         found = outer_tube(loop, linear, attempt)
-        middle = 0
+        # How far outages lead grows with their length behind a predictor, with its square where a pose is held.
+        expected = 0.0 if found is None else attempt / found.largest_share ** (1.0 if linear.predicts else 0.5)
         if found is not None and found.largest_share <= 1.0:
             inside, tube = attempt, found
+            wanted = max(int(expected), inside + inside // 50) if inside > LONG else 0
         else:
             outside = attempt
-            nearer = 0.99 if attempt > LONG else 1.0
-            middle = 0 if found is None else int(nearer * attempt / math.sqrt(found.largest_share))
-        attempt = middle if inside < middle < outside else (inside + outside) // 2
+            wanted = int((0.99 if attempt > LONG else 1.0) * expected)
+        attempt = wanted if inside < wanted < outside else (inside + outside) // 2
     return inside, tube
 
 
