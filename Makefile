@@ -10,7 +10,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test coverage bench fuzz torture docs sample clean
+.PHONY: demo test coverage bench fuzz torture dist lowest pythons docs sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -35,6 +35,15 @@ fuzz: $(VENV)/test.stamp ## damaged bags against independent readers, a million 
 torture: $(VENV)/test.stamp ## signals to every process of a run, wild messages, damaged bags; MINUTES=20
 	$(BIN)/python -m torture --minutes $(or $(MINUTES),20) --json torture.json
 
+dist: $(VENV)/test.stamp ## source archive and wheel of the newest commit, checked and tried, in dist/
+	$(BIN)/python -m release
+
+lowest: $(VENV)/test.stamp ## the cheap tests with the lowest versions of packages that setup.py allows
+	$(BIN)/python -m release.environments lowest-direct 3.10
+
+pythons: $(VENV)/test.stamp ## the cheap tests with each version of Python that can be had; PYTHONS=3.12 for one
+	$(BIN)/python -m release.environments highest $(or $(PYTHONS),3.10 3.11 3.12 3.13 3.14)
+
 docs: $(VENV)/run.stamp ## bring README.md and docs/ up to date with the code
 	$(BIN)/python docs/update.py
 
@@ -49,7 +58,7 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(if $(HAVE_ROS),--system-site-packages) $(VENV)
 
 $(VENV)/run.stamp: $(VENV)/bin/python setup.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.$(if $(HAVE_ROS),,[ros])'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all$(if $(HAVE_ROS),,$(comma)ros)]'
 	touch $@
 
 $(VENV)/test.stamp: $(VENV)/bin/python setup.py

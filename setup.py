@@ -6,6 +6,23 @@ from setuptools import find_packages, setup
 
 PACKAGE = "agv_ncs"
 
+EXTRAS = {
+    # Recording, compressed bags of others, and what their messages mean where they do not say it themselves.
+    "bags": ["isal>=1.1", "lz4>=4.0", "mcap>=1.6", "rosbags>=0.10.9", "zstandard>=0.18"],
+    # Pictures and the page for the browser.
+    "report": ["jinja2>=3.0", "matplotlib>=3.6", "plotly>=6.0"],
+    # The page of `agv-ncs explore`.
+    "explore": ["dash>=3.0", "flask>=2.2", "plotly>=6.0", "werkzeug>=3.0"],
+    # Sweeps on a Dask cluster, and results as Parquet.
+    "cluster": ["distributed>=2023.1"],
+    "parquet": ["pyarrow>=12.0"],
+    # Captures of packets as measured links.
+    "captures": ["dpkt>=1.9"],
+    # irtt's JSON at several times the speed.
+    "irtt": ["msgspec>=0.18"],
+}
+ALL = sorted({package for packages in EXTRAS.values() for package in packages})
+
 setup(
     name=PACKAGE,
     version="0.1.0",
@@ -29,47 +46,31 @@ setup(
         (f"share/{PACKAGE}/config", sorted(map(str, Path("config").iterdir()))),
         (f"share/{PACKAGE}/launch", sorted(map(str, Path("launch").glob("*.launch.py")))),
     ],
+    # The loop, its simulation and its verdict, each with a Debian package; what has none is in an extra.
     install_requires=[
-        "setuptools",
+        "setuptools>=64",
         "click>=8.1",
-        "isal>=1.1",
-        "jinja2>=3.0",
-        "matplotlib>=3.6",
-        "lz4>=4.0",
-        "mcap>=1.6",
         "numba>=0.57",
         "numpy>=1.23",
         "packaging>=22.0",
-        "plotly>=6.0",
         "pyyaml>=6.0",
         "rich>=12.0",
-        "rosbags>=0.10",
-        "zstandard>=0.18",
     ],
-    extras_require={
+    extras_require=EXTRAS
+    | {
+        # Everything but ROS itself and what only tests need.
+        "all": ALL,
         # ROS 2 Jazzy's rclpy with Fast DDS from PyPI, for machines where no ROS is installed.
         "ros": ["ros-jazzy-rclpy>=7.1.6", "ros-rclpy[fastrtps]>=7.1.6", "ros-jazzy-common-interfaces>=5.3.6"],
-        # The page of `agv-ncs explore`.
-        "explore": ["dash>=3.0"],
-        # Sweeps on a Dask cluster, and results as Parquet.
-        "cluster": ["distributed>=2023.1"],
-        "parquet": ["pyarrow>=12.0"],
-        # Captures of packets as measured links.
-        "captures": ["dpkt>=1.9"],
-        # irtt's JSON at several times the speed.
-        "irtt": ["msgspec>=0.18"],
         "test": [
+            *ALL,
+            "build>=1.0",
             "colcon-common-extensions",
-            "dash>=3.0",
-            "distributed>=2023.1",
-            "dpkt>=1.9",
             "hypothesis>=6.80",
             "mcap-ros2-support>=0.5",
-            "msgspec>=0.18",
             "mypy>=1.10",
             "pandas>=2.0",
             "polars>=1.0",
-            "pyarrow>=12.0",
             "pypdfium2>=4.0",
             "pytest>=7.4",
             "pytest-cov>=4.1",
@@ -77,18 +78,21 @@ setup(
             "ruff>=0.6",
             "scipy>=1.9",
             "selenium>=4.11",
+            "twine>=5.0",
             "types-PyYAML",
+            "uv>=0.4",
+            "wheel>=0.40",
         ],
     },
     zip_safe=False,
     entry_points={
         "console_scripts": [
             "agv-ncs = agv_analysis.cli:main",
-            "plant = agv_plant.plant_node:main",
-            "relay = agv_plant.relay_node:main",
-            "error_detector = agv_cloud.error_detector_node:main",
-            "controller = agv_cloud.controller_node:main",
-            "recorder = agv_analysis.runtime.recorder_node:main",
+            "plant = agv_analysis.runtime.executables:plant",
+            "relay = agv_analysis.runtime.executables:relay",
+            "error_detector = agv_analysis.runtime.executables:error_detector",
+            "controller = agv_analysis.runtime.executables:controller",
+            "recorder = agv_analysis.runtime.executables:recorder",
         ],
     },
 )

@@ -13,7 +13,7 @@ import click
 
 COMMANDS = (
     "run", "analyse", "stability", "channel", "link", "probe", "require", "parameters", "simulate", "explore", "sweep",
-    "bag", "replay", "reproduce", "doctor",
+    "bag", "replay", "reproduce", "node", "doctor",
 )  # fmt: skip
 
 
@@ -39,6 +39,14 @@ class _Group(click.Group):
             if error.filename is None:
                 raise
             raise click.ClickException(printable(f"{error.filename}: {error.strerror}")) from None
+        except ModuleNotFoundError as error:
+            from agv_analysis.doctor.extras import extra_with
+
+            missing = (error.name or "").partition(".")[0]
+            if (extra := extra_with(missing)) is None:
+                raise
+            said = f"this needs {missing}, which is not installed: pip install 'agv_ncs[{extra}]'"
+            raise click.ClickException(said) from None
         except UserError as error:
             raise click.ClickException(printable(str(error))) from None
 

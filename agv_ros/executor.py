@@ -140,7 +140,7 @@ def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = No
     What is wrong with a parameter or a file is said in one line, with exit status 1.
     """
     with stop_on_signals() as stop:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
         try:
             failure = _run(make, stop)
         finally:

@@ -171,6 +171,7 @@ def main() -> None:
     (REPOSITORY / "docs/stability.md").write_text(stability_page(), encoding="utf-8")
     (REPOSITORY / "docs/python_api.md").write_text(python_api_page(), encoding="utf-8")
     (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
+    subprocess.run([sys.executable, "docs/public_api.py"], cwd=REPOSITORY, check=True)
     (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")
 
 

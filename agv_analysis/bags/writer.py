@@ -18,10 +18,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from agv_analysis.bags.mcap_output import McapOutput, Recorded
 from agv_analysis.bags.rosbag2_metadata import TopicInfo, metadata_text, rosbag2_metadata
 from agv_ros.errors import UserError
+
+if TYPE_CHECKING:
+    from agv_analysis.bags.mcap_output import McapOutput, Recorded
 
 METADATA_NAME = "agv_ncs"
 """Name of the MCAP metadata record that holds the run's version, seed and parameters."""
@@ -64,6 +67,18 @@ def new_directory(directory: Path) -> Iterator[None]:
         raise UserError(f"{directory}: cannot be recorded to: {error.strerror}") from None
 
 
+def _output() -> type[McapOutput]:
+    """What writes the file. Raises UserError if the library for it is not installed."""
+    try:
+        from agv_analysis.bags.mcap_output import McapOutput
+    except ModuleNotFoundError:
+        raise UserError(
+            "writing a bag needs mcap, which is not installed: pip install 'agv_ncs[bags]'; "
+            "without it, record with `ros2 bag record -s mcap`"
+        ) from None
+    return McapOutput
+
+
 class BagWriter:
     """An open bag. `describe` is asked for a topic, by its number, once there are some messages, or at the end.
 
@@ -95,8 +110,9 @@ class BagWriter:
         self._late: list[Recorded] = []
         self.counts = [0] * len(describe)
         self._first_ns, self._last_ns = 2**63, 0
+        output = _output()  # before there is a directory
         with new_directory(directory):
-            self._file = McapOutput(directory / self._file_name, describe, self._about, sync)
+            self._file = output(directory / self._file_name, describe, self._about, sync)
 
     def write(self, topic: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add a message to the topic with this number."""
@@ -167,7 +183,7 @@ class BagWriter:
         path = self._directory / f"{self._file_name}.part"
         with contextlib.suppress(OSError):
             known = [partial(self._file.topics.__getitem__, number) for number in range(len(self.counts))]
-            file = McapOutput(path, known, self._about, sync=False)
+            file = _output()(path, known, self._about, sync=False)
             try:
                 for number in self._first:
                     file.register(number, self._file.topics[number])

@@ -94,7 +94,7 @@ def _notes(found: Examination) -> Iterator[str]:
     elif domain > network.LARGEST_DOMAIN:
         yield f"ROS_DOMAIN_ID is {domain}: its ports may be taken by any program on Linux; take 0 .. 101"
     if found.clocks["synchronised"] is False:
-        yield "the time of day is not synchronised: ages of poses between two hosts are then off by the clocks' offset"
+        yield "the time of day is not synchronised: between two hosts a drift of the clocks counts as age of the poses"
     governors = [name for name in found.cores["governors"] if name not in ("performance", "schedutil")]
     if governors:
         yield f"the cores' frequency follows the governor {', '.join(governors)}: `performance` has the least jitter"

@@ -28,6 +28,14 @@ def requirements() -> dict[str, list[Requirement]]:
     }
 
 
+def extra_with(name: str) -> str | None:
+    """The extra that brings a package, None if none does: the narrowest, so neither `all` nor `test`."""
+    brings = {
+        extra: len(packages) for extra, packages in requirements().items() if name in {one.name for one in packages}
+    }
+    return min((extra for extra in brings if extra), key=lambda extra: brings[extra], default=None)
+
+
 def installed(needed: list[Requirement]) -> dict[str, Any]:
     """Versions of the packages that are there, and what is missing or too old, as pip would be asked for it."""
     versions = {one.name: version_of(one.name) for one in needed}

@@ -39,7 +39,7 @@ def discovery(environment: Mapping[str, str] = os.environ) -> dict[str, Any]:
     return {
         "domain": domain,
         "domain_said": said,
-        "range": environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") or "SUBNET",
+        "range": environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "") or "not set",
         "static_peers": environment.get("ROS_STATIC_PEERS", ""),
         "discovery_server": environment.get("ROS_DISCOVERY_SERVER", ""),
         "profiles": environment.get("FASTRTPS_DEFAULT_PROFILES_FILE", "") or environment.get("CYCLONEDDS_URI", ""),

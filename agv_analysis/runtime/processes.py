@@ -19,6 +19,7 @@ from typing import Any
 
 import click
 
+from agv_analysis.runtime.executables import NODE_MODULES
 from agv_analysis.runtime.outcome import Outcome
 from agv_analysis.runtime.run_setup import AS_USUAL, OnDisk, params_file, recording_of, scenario_that_waits
 from agv_analysis.runtime.runner import Progress, run_fleet
@@ -29,14 +30,6 @@ from agv_ros.errors import UserError
 from agv_ros.executor import ENDS_WITH_STDIN, Stop, stop_on_signals
 from agv_ros.node import STOPPED_BY
 from agv_ros.parameters import as_dict
-
-_MODULES = {
-    "plant": "agv_plant.plant_node",
-    "relay": "agv_plant.relay_node",
-    "error_detector": "agv_cloud.error_detector_node",
-    "controller": "agv_cloud.controller_node",
-    "recorder": "agv_analysis.runtime.recorder_node",
-}
 
 _STOP_TIMEOUT = 20.0
 """How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
@@ -175,7 +168,7 @@ def _drive_vehicle(name: str, params: str, bag: str, on_disk: str) -> None:
 
 def _node_command(name: str, params: Path, settings: dict[str, Any]) -> list[str]:
     """Command that starts a node."""
-    command = [sys.executable, "-m", _MODULES[name], "--ros-args", "--params-file", str(params)]
+    command = [sys.executable, "-m", NODE_MODULES[name], "--ros-args", "--params-file", str(params)]
     for parameter, value in settings.items():
         command += ["-p", f"{parameter}:={json.dumps(value)}"]
     return command

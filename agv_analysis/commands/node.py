@@ -1,0 +1,23 @@
+"""`agv-ncs node`: one node of the loop, where there is no `ros2 run`."""
+
+from __future__ import annotations
+
+import click
+
+from agv_analysis.commands import needs_ros
+from agv_analysis.runtime.executables import NODE_MODULES, run_node_of
+
+
+@click.command("node", context_settings={"ignore_unknown_options": True})
+@click.argument("name", type=click.Choice(list(NODE_MODULES)), metavar="NAME")
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def command(name: str, arguments: tuple[str, ...]) -> None:
+    """Run the node NAME (plant, relay, error_detector, controller or recorder) with ARGUMENTS, as `ros2 run` does.
+
+    \b
+    Examples:
+      agv-ncs node relay --ros-args --params-file config/outages.yaml
+      agv-ncs node recorder --ros-args -p bag:=bags/first -p params_file:=config/outages.yaml
+    """
+    with needs_ros():
+        run_node_of(name, arguments)
