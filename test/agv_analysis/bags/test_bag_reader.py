@@ -183,15 +183,25 @@ def test_times_that_cannot_be_are_found_in_large_files_too(
 
 @pytest.mark.usefixtures("as_large")
 def test_a_topic_of_a_large_file_that_cannot_be_decoded(tmp_path: Path) -> None:
-    """Some of its messages are so long that the array would be out of all proportion to the others."""
+    """One in twenty of its messages is so long that the array would be out of all proportion to the others."""
     text = _type(TEXT)
-    parts = [("/chatter", 10**9 + i, text("x" * (1 if i % 1000 else 10**5))) for i in range(2001)]
+    parts = [("/chatter", 10**9 + i, text("x" * (1 if i % 20 else 10**5))) for i in range(2001)]
     write_mcap(tmp_path / "bag.mcap", [*parts, ("/amcl_pose", 2 * 10**9, pose(1))], **VARIANTS["without summary"])
     bag = read_bag(tmp_path / "bag.mcap")
     with pytest.raises(BagError, match="/chatter: cannot be decoded: its strings or sequences differ so much"):
         bag["/chatter"]
     assert len(bag["/amcl_pose"]) == 1
     assert bag.topics["/chatter"].count == 2001
+
+
+@pytest.mark.usefixtures("as_large")
+def test_a_few_messages_of_a_large_file_that_are_out_of_all_proportion(tmp_path: Path) -> None:
+    text = _type(TEXT)
+    parts = [("/chatter", 10**9 + i, text("x" * (1 if i % 1000 else 10**5))) for i in range(2001)]
+    write_mcap(tmp_path / "bag.mcap", parts, **VARIANTS["without summary"])
+    bag = read_bag(tmp_path / "bag.mcap")
+    assert len(bag["/chatter"]) == 1998
+    assert [problem for problem in bag.problems if "/chatter" in problem and problem.endswith(": 3")]
 
 
 def test_what_is_not_checked_is_said(tmp_path: Path) -> None:
