@@ -634,6 +634,15 @@ def test_in_real_time_the_agv_plays_its_plan_and_then_stands_still(bench: Bench)
 # -- processes --------------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def heeded_hangup() -> Iterator[None]:
+    """Processes that a test starts heed SIGHUP, even where the tests themselves run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("heeded_hangup")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 @pytest.mark.parametrize("module", [*NODES, "agv_analysis.runtime.recorder_node"])
 def test_a_waiting_node_ends_cleanly_on_signals(
