@@ -284,9 +284,9 @@ class LoopNode(Node, Generic[P]):
 
         Called before a step's answer is published, so that no other node's report of the step can come before it.
         """
-        k = self._period_of(stamp_ns)
-        self._last_ns = max(self._last_ns, stamp_ns)
-        if k % self._steps_per_report == 0:
+        if stamp_ns > self._last_ns:
+            self._last_ns = stamp_ns
+        if self._period_of(stamp_ns) % self._steps_per_report == 0:
             self.report(stamp_ns)
 
     def _period_of(self, stamp_ns: int) -> int:

@@ -308,12 +308,12 @@ class LoopParameters:
         "agv1/ for one AGV of several; all share the frame map",
     )
 
-    @property
+    @functools.cached_property
     def window_steps(self) -> int:
         """Whole periods of `stamp_window`, one at least."""
         return max(1, round(self.stamp_window / self.ts))
 
-    @property
+    @functools.cached_property
     def steps_ahead(self) -> int:
         """Whole periods that edge/error looks ahead."""
         return round(self.look_ahead / self.ts)

@@ -132,12 +132,13 @@ class Loop(NamedTuple):
     """All of them but the recorder."""
     recorder: RecorderNode | None
 
+    def all_nodes(self) -> Sequence[LoopNode[Any]]:
+        """With the recorder, if there is one."""
+        return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
+
     def is_over(self) -> bool:
-        """Has the plant done its steps, or can a node not go on? Asked after each event."""
-        for node in self.nodes:  # a generator takes four times as long
-            if node.finished:
-                return True
-        return self.recorder is not None and self.recorder.finished
+        """Has the plant done its steps, or can a node not go on?"""
+        return any(node.finished for node in self.all_nodes())
 
     def outcome(self, rate: float, stopped: bool) -> Outcome:
         """How it ended."""
@@ -152,7 +153,7 @@ class Loop(NamedTuple):
 def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: Progress) -> list[Outcome]:
     """Run loops until all have done all their steps; `progress` receives the total of their steps."""
     for loop in loops:
-        for node in (*loop.nodes, loop.recorder) if loop.recorder else loop.nodes:
+        for node in loop.all_nodes():
             add(executor, node)
     watch = _Watch(loops, stop, progress)
     try:
@@ -185,6 +186,8 @@ class _Watch:
         self._unfinished = list(loops)
         self._stop, self._progress = stop, progress
         self._asked = 0
+        self._watched: Sequence[LoopNode[Any]] = []
+        self._go_on()
         self.paces = [Speedometer() for _ in loops]
 
     def is_done(self) -> bool:
@@ -192,9 +195,17 @@ class _Watch:
         self._asked += 1
         if self._asked % _EVENTS_PER_LOOK == 0:
             self.look()
-        while self._unfinished and self._unfinished[-1].is_over():  # one is looked at, for one is enough
+        for node in self._watched:  # one loop is looked at, for one that goes on is enough
+            if node.finished:
+                self._go_on()
+                break
+        return self._stop.requested or not self._unfinished
+
+    def _go_on(self) -> None:
+        """Leave out loops that have ended, until there is one to watch."""
+        while self._unfinished and self._unfinished[-1].is_over():
             self._unfinished.pop()
-        return not self._unfinished or self._stop.requested
+        self._watched = self._unfinished[-1].all_nodes() if self._unfinished else []
 
     def look(self) -> None:
         """See how far each is."""
