@@ -155,14 +155,24 @@ def _repeated_outcomes(chain: Chain) -> NDArray[np.bool_] | None:
 
 
 def _growth_of_repeated(loop: LinearLoop, lost: NDArray[np.bool_]) -> float:
-    """Growth of the second moments over a lap if `lost`, shape (P,), repeats: of the places to begin at the worst."""
+    """Growth of the second moments over a lap if `lost`, shape (P,), repeats."""
     rows = 1 if loop.is_constant else loop.steps
-    together = math.lcm(rows, len(lost))
-    repeated = np.resize(lost, together)
-    largest = max(
-        float(drop_sequence(loop, np.roll(repeated, begin), 1)[0]) for begin in range(math.gcd(rows, len(lost)))
-    )
-    return 2.0 * largest * (loop.steps / together)
+    repeated = np.resize(lost, math.lcm(rows, len(lost)))
+
+    def log_radius(begin: int) -> float:
+        return float(drop_sequence(loop, np.roll(repeated, begin), 1)[0])
+
+    return growth_of_repeated(rows, len(lost), log_radius) * (loop.steps / rows)
+
+
+def growth_of_repeated(rows: int, period: int, log_radius: Callable[[int], float]) -> float:
+    """Growth of second moments over `rows` steps, after which a loop is as before, if outcomes repeat every `period`.
+
+    Both are as before after their least common multiple; `log_radius` is that of the loop over so many steps, if it and
+    the outcomes begin so many steps apart. Of the places to begin that lead to different ones the worst counts.
+    """
+    largest = max(map(log_radius, range(math.gcd(rows, period))))
+    return 2.0 * largest * (rows / math.lcm(rows, period))
 
 
 def _drive(loop: LinearLoop, chain: Chain, moments: Moments) -> Callable[[int], float]:

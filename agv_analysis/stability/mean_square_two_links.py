@@ -32,7 +32,7 @@ from agv_analysis.link.joint_chain import OUTCOMES, JointChain
 from agv_analysis.link.markov_channel import cycle_of
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.mean_square import growth_over_lap
+from agv_analysis.stability.mean_square import growth_of_repeated, growth_over_lap
 from agv_analysis.stability.products import assign, divide, largest_entry
 
 POLICIES = ("hold", "zero")
@@ -53,7 +53,12 @@ def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> floa
         return loop.steps * math.log(np.abs(np.linalg.eigvals(operator(maps[0], links))).max())
     cycle = cycle_of(links.transition)
     if cycle is not None and bool(np.isin(links.outcomes, (0.0, 1.0)).all()):
-        return _growth_of_repeated(maps, links.outcomes[cycle].argmax(axis=1), loop.steps)
+        repeated = links.outcomes[cycle].argmax(axis=1)
+        together = math.lcm(len(maps), len(repeated))
+        growth = growth_of_repeated(
+            len(maps), len(repeated), lambda begin: _log_spectral_radius(maps, repeated, begin, together)
+        )
+        return growth * (loop.steps / len(maps))
     moments = np.array(np.broadcast_to(np.eye(size), (states, size, size)), order="C")
     return growth_over_lap(loop, (moments,), lambda steps: float(compiled(_drive_lap)(maps, *links, steps, moments)))
 
@@ -77,16 +82,6 @@ def operator(maps: Floats, links: JointChain) -> Floats:
     rows = np.einsum("so,oij->sij", links.outcomes, squares)
     size = len(links.transition) * squares.shape[1]
     return np.asarray(np.einsum("st,sij->tisj", links.transition, rows).reshape(size, size))
-
-
-def _growth_of_repeated(maps: Floats, outcomes: NDArray[np.int64], steps: int) -> float:
-    """Growth over a lap of so many steps if `outcomes`, shape (P,), repeat: of the places to begin at the worst.
-
-    By one trajectory: second moments by state would cost P times as much.
-    """
-    together = math.lcm(len(maps), len(outcomes))
-    beginnings = range(math.gcd(len(maps), len(outcomes)))
-    return 2.0 * max(_log_spectral_radius(maps, outcomes, begin, together) for begin in beginnings) * (steps / together)
 
 
 def _log_spectral_radius(maps: Floats, outcomes: NDArray[np.int64], begin: int, steps: int) -> float:
