@@ -42,6 +42,8 @@ from agv_ros.stamps import NS_PER_S
 
 _HEADER = 4
 _MAX_STRING = 4096
+_LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
+"""Length word of a string, by byte order."""
 
 
 @lru_cache(maxsize=512)
@@ -65,7 +67,7 @@ def _order(data: bytes) -> str:
 def _string_length(order: str, data: bytes, position: int) -> int:
     """Length word of the string at `position`, counted from the end of the encapsulation header."""
     try:
-        (length,) = struct.unpack_from(order + "I", data, _HEADER + position)
+        (length,) = _LENGTH[order].unpack_from(data, _HEADER + position)
     except struct.error:
         raise InvalidMessageError(f"message ends inside a string, after {len(data)} bytes") from None
     if length > _MAX_STRING:
@@ -106,6 +108,12 @@ def stamp_of(data: bytes) -> int:
 _LITTLE = b"\x00\x01\x00\x00"
 
 
+@lru_cache(maxsize=512)
+def _string(text: str) -> bytes:
+    """A string as CDR holds it, with the zero at its end."""
+    return text.encode() + b"\0"
+
+
 def padded(data: bytes) -> bytes:
     """Message filled up to whole 4-byte words, as RTPS does on its way between processes but not within one.
 
@@ -121,7 +129,7 @@ def encode_clock(stamp_ns: int) -> bytes:
 
 def encode_pose(pose: StampedPose) -> bytes:
     """geometry_msgs/PoseStamped in frame `map`; z, roll and pitch are zero."""
-    frame = FRAME_MAP.encode() + b"\0"
+    frame = _string(FRAME_MAP)
     layout = _layout("<", "iI", (len(frame),), "7d", 8)
     z, w = quaternion_of_yaw(pose.theta)
     return _LITTLE + layout.pack(*_split(pose.stamp_ns), len(frame), frame, pose.x, pose.y, 0.0, 0.0, 0.0, z, w)
@@ -138,7 +146,7 @@ def decode_pose(data: bytes) -> StampedPose:
 
 def encode_transform(pose: StampedPose, child: str) -> bytes:
     """tf2_msgs/TFMessage with one transform: where frame `child` is in frame `map`."""
-    frame, child_frame = FRAME_MAP.encode() + b"\0", child.encode() + b"\0"
+    frame, child_frame = _string(FRAME_MAP), _string(child)
     layout = _layout("<", "IiI", (len(frame), len(child_frame)), "7d", 8)
     z, w = quaternion_of_yaw(pose.theta)
     return _LITTLE + layout.pack(
@@ -148,7 +156,7 @@ def encode_transform(pose: StampedPose, child: str) -> bytes:
 
 def encode_command(command: Command, prefix: str = "") -> bytes:
     """geometry_msgs/TwistStamped in frame `base_link`, whose name begins with `prefix`."""
-    frame = (prefix + FRAME_AGV).encode() + b"\0"
+    frame = _string(prefix + FRAME_AGV)
     layout = _layout("<", "iI", (len(frame),), "6d", 8)
     return _LITTLE + layout.pack(*_split(command.stamp_ns), len(frame), frame, command.v, 0.0, 0.0, 0.0, 0.0, command.w)
 
@@ -176,7 +184,7 @@ def encode_error(error: TrackingError, prefix: str = "") -> bytes:
 
     The names of both frames begin with `prefix`.
     """
-    frame, child = (prefix + FRAME_AGV).encode() + b"\0", (prefix + FRAME_REFERENCE).encode() + b"\0"
+    frame, child = _string(prefix + FRAME_AGV), _string(prefix + FRAME_REFERENCE)
     layout = _odometry_layout("<", len(frame), len(child))
     z, w = quaternion_of_yaw(error.theta_e)
     return _LITTLE + layout.pack(
@@ -206,7 +214,7 @@ def encode_slot(slot: Slot) -> bytes:
 
     The note goes into header.frame_id, which this type has no other use for.
     """
-    source, note = slot.outcome.encode() + b"\0", slot.note.encode() + b"\0"
+    source, note = _string(slot.outcome), _string(slot.note)
     layout = _layout("<", "iI", (len(note),), f"iII{len(source)}s", 4)
     return padded(
         _LITTLE + layout.pack(*_split(slot.stamp_ns), len(note), note, *_split(slot.freshest_ns), len(source), source)
@@ -223,6 +231,7 @@ def decode_slot(data: bytes) -> Slot:
     return Slot(int(values[0]) * NS_PER_S + int(values[1]), freshest, _text(values[-1]), _text(values[3]))
 
 
+@lru_cache(maxsize=512)
 def _text(value: object) -> str:
     assert isinstance(value, bytes)
     return value.rstrip(b"\0").decode("utf-8", "replace")
@@ -230,7 +239,7 @@ def _text(value: object) -> str:
 
 def _aligned_string(text: str) -> bytes:
     """A string that begins and ends on a whole word."""
-    content = text.encode() + b"\0"
+    content = _string(text)
     return padded(struct.pack("<I", len(content)) + content)
 
 

@@ -112,7 +112,10 @@ class MessageSync(Generic[M]):
         return done
 
     def _first_ready(self) -> int | None:
-        return next((i for i, slot in enumerate(self._waiting) if self._is_here(slot.freshest_ns)), None)
+        for i, slot in enumerate(self._waiting):
+            if slot.freshest_ns == self._settled_ns or slot.freshest_ns in self._arrived:
+                return i
+        return None
 
     def _forget_what_waits_in_vain(self) -> None:
         """If one of the two topics is silent, the other must not fill the memory."""
@@ -123,16 +126,14 @@ class MessageSync(Generic[M]):
             del self._arrived[next(iter(self._arrived))]
             self.outdated += 1
 
-    def _is_here(self, stamp_ns: int) -> bool:
-        return stamp_ns == self._settled_ns or stamp_ns in self._arrived
-
     def _settle(self, slot: Slot) -> Joined[M]:
         message = self._arrived.pop(slot.freshest_ns, None)
         if message is not None:
             self._held = message
         self._settled_ns = slot.freshest_ns
-        later = {ns: message for ns, message in self._arrived.items() if ns > slot.freshest_ns}
-        self.outdated += len(self._arrived) - len(later)  # overtaken before they were needed
-        self._arrived = later
+        if self._arrived:
+            later = {ns: message for ns, message in self._arrived.items() if ns > slot.freshest_ns}
+            self.outdated += len(self._arrived) - len(later)  # overtaken before they were needed
+            self._arrived = later
         self._last_slot_ns = slot.stamp_ns
         return Joined(slot, self._held)

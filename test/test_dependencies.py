@@ -159,7 +159,7 @@ def test_a_bag_is_not_begun_that_cannot_be_written(tmp_path: Path, monkeypatch: 
     from agv_analysis.bags.writer import BagWriter
     from agv_ros.errors import UserError
 
-    for name in ("mcap", "mcap.records", "mcap.stream_reader", "mcap.writer"):
+    for name in ("mcap", "mcap.data_stream", "mcap.opcode", "mcap.records", "mcap.stream_reader"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.delitem(sys.modules, "agv_analysis.bags.mcap_output", raising=False)
     with pytest.raises(UserError, match=r"agv_ncs\[bags\]"):

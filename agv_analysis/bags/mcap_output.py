@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
 
+from agv_analysis.bags.mcap_writer import McapWriter
 from agv_analysis.bags.rosbag2_metadata import TopicInfo, metadata_text
 
 _CHUNK = 256 * 1024
@@ -81,12 +81,9 @@ class McapOutput:
         self._file = _WholeWrites(path)
         self._disk = ThreadPoolExecutor(1, "disk") if sync else None
         self._synced: Future[None] | None = None
-        self._writer = Writer(
-            self._file,  # type: ignore[arg-type]  # all that is used of a stream
-            chunk_size=_CHUNK, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True,
-        )  # fmt: skip
-        self._writer.start(profile="ros2", library=f"agv_ncs {metadata[1].get('version', '')}".strip())
-        self._writer.add_metadata(metadata[0], dict(metadata[1]))
+        library = f"agv_ncs {metadata[1].get('version', '')}".strip()
+        self._writer = McapWriter(self._file, _CHUNK, library)
+        self._writer.add_metadata(*metadata)
 
     def write(self, messages: Iterable[Recorded]) -> None:
         """Add messages. Raises OSError."""
@@ -106,7 +103,7 @@ class McapOutput:
 
     def finish_chunk(self) -> None:
         """Give the system all messages so far. Raises OSError."""
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.flush()
         self.check()
 
     def check(self) -> None:
@@ -120,8 +117,8 @@ class McapOutput:
     def finish(self, metadata: Sequence[tuple[str, Mapping[str, str]]]) -> None:
         """Write metadata records, the index and the end, and close the file. Raises OSError."""
         for name, content in metadata:
-            self._writer.add_metadata(name, dict(content))
-        self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.add_metadata(name, content)
+        self._writer.finish()
         self.check()
         if self._disk is not None:
             self._disk.submit(self._file.sync).result()

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import yaml
-from mcap.writer import CompressionType, Writer
 
 from agv_analysis.bags.bag import Progress
 from agv_analysis.bags.bag_errors import BagError, UndecodableError
 from agv_analysis.bags.checksum import crc32
 from agv_analysis.bags.findings import Findings
 from agv_analysis.bags.known_types import Definition, KnownTypes
+from agv_analysis.bags.mcap_writer import McapWriter
 from agv_analysis.bags.message_batch import Batch, Layouts
 from agv_analysis.bags.message_compression import inflated_batches
 from agv_analysis.bags.records import DATA_END_SIZE, FOOTER_SIZE, MAGIC, QOS, RECORD, TYPE_HASH, Channel, Schema
@@ -30,6 +30,9 @@ from agv_analysis.bags.storage import Storage
 from agv_analysis.bags.topic_types import TopicTypes
 
 _PIECE = 2**20
+
+_CHUNK = 2**20
+"""Size of a chunk [B]."""
 
 
 class Recovery(NamedTuple):
@@ -138,8 +141,7 @@ class _Copy:
         self._checked: dict[tuple[str, str, int], _Checked] = {}
         self._first_ns, self._last_ns = 2**63 - 1, 0
         self._file = path.open("x+b")
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD, enable_crcs=True, enable_data_crcs=True)
-        self._writer.start(profile="ros2", library="agv_ncs")
+        self._writer = McapWriter(self._file, _CHUNK, "agv_ncs")
 
     def add(self, storage: Storage) -> Iterator[float]:
         """Copy all that is whole in a file; yields the share that is done."""
@@ -208,7 +210,7 @@ class _Copy:
             self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata_text(about)})
         if metadata is not None:
             metadata.write_text(metadata_text({"rosbag2_bagfile_information": about}), encoding="utf-8")
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._writer.finish()
         if self._has_foreign:
             _seal(self._file)
         self._file.close()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from agv_plant.channels.model import GOOD
 from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.radio.channel import Channel, SlotOutcome
-from agv_plant.radio.delay import EXPIRED, whole_slots
+from agv_plant.radio.delay import EXPIRED, soonest, whole_slots
 from agv_ros.messages import DELAYED, DELIVERED, LOST, Slot
 from agv_ros.stamps import MAX_LEAP, Grid, NearestSteps, Steps
 
@@ -76,13 +76,14 @@ class Link:
 
     def _send(self, k: int, stamp_ns: int, message: bytes) -> int:
         """Put a message, and its copy if there is one, under way; returns the slots until the first of them arrives."""
-        delays = [delay for delay in self.channel.delays(k) if delay >= 0.0]
-        for delay in delays:
-            arrival = k + whole_slots(delay), k + delay
-            heapq.heappush(self._under_way, (*arrival, self._order, stamp_ns, message))
-            self._order += 1
-        self.copies += len(delays) - 1
-        return whole_slots(min(delays))
+        first, copy = self.channel.delays(k)
+        for delay in (first, copy):
+            if delay >= 0.0:
+                arrival = k + whole_slots(delay), k + delay
+                heapq.heappush(self._under_way, (*arrival, self._order, stamp_ns, message))
+                self._order += 1
+        self.copies += first >= 0.0 and copy >= 0.0
+        return soonest(first, copy)
 
     def _count(self, outcome: SlotOutcome, wait: int) -> None:
         self.sent += 1
