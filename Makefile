@@ -5,6 +5,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := bags/demo
 
+# Many tests wait, for processes to start and for DDS, so cores have time for more of them.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print(max(1, 3 * len(os.sched_getaffinity(0)) // 2))')
+
 HAVE_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
 comma := ,
 
@@ -21,7 +24,7 @@ test: $(VENV)/test.stamp ## style, types and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n auto --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n $(WORKERS) --dist worksteal $(PYTEST_ARGS)
 
 coverage: PYTEST_ARGS += --cov --cov-report=term ## the same with coverage, which takes longer
 coverage: test
