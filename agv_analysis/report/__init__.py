@@ -8,6 +8,10 @@
     matplotlib_figures  panels as figures for a paper, SVG and PDF
     overview            four panels on one sheet
     margin_map_files    a map of margins as CSV and picture
+    tiles               the row of figures under the report's sentence
+    cannot_say          what a run leaves open
+    parameter_lines     parameters, and which are not the defaults
+    packed              figures as compressed text in a page
     page                the report of a run, one HTML file
     sweep_page          the report of a sweep
 

@@ -12,6 +12,9 @@ from agv_analysis.corridor.widths import Widths
 from agv_analysis.report.panels import DRIVEN, LIMIT, OTHER, Line, Panel
 from agv_analysis.run import Floats
 
+_MOST_PLACES = 2000
+"""Places of a lap at which an edge is drawn: closer than a pixel on any screen."""
+
 
 def corridor_panel(found: Corridor) -> Panel:
     """Largest distance from the reference over a lap: after one outage that begins there, and in the tube for any."""
@@ -34,13 +37,14 @@ def edges(found: Corridor) -> tuple[Line, ...]:
 
 
 def edges_along(lap: Floats, widths: Widths, tube: Tube | None, remark: str = "") -> tuple[Line, ...]:
-    """The same of a lap, shape (N, 5), with a remark on the tube, or on why there is none."""
+    """The same of a lap, shape (N, 5), with a remark on the tube, or on why there is none; at some of its places."""
+    some = np.unique(np.linspace(0, len(lap) - 1, min(len(lap), _MOST_PLACES)).astype(np.int64))
     remark = f" ({remark})" if remark else ""
     name = "corridor" if tube is not None else f"corridor{remark}"
-    lines = [_edge(name, lap, np.full(len(lap), widths.half_width), LIMIT)]
+    lines = [_edge(name, lap[some], np.full(len(some), widths.half_width), LIMIT)]
     if tube is not None:
         name = f"tube for any outages up to {tube.n} slots{remark}"
-        lines.append(_edge(name, lap, _of_lap(tube.distance, len(lap)), OTHER))
+        lines.append(_edge(name, lap[some], _of_lap(tube.distance, len(lap))[some], OTHER))
     return tuple(lines)
 
 

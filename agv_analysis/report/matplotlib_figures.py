@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 from agv_analysis.output_file import output_file
 from agv_analysis.report.panels import (
     BARS,
+    DEVIATIONS,
     DRIVEN,
+    HALOS,
     LIMIT,
     LOST,
     MARKERS,
@@ -38,7 +40,10 @@ STYLE: Any = {
     "svg.hashsalt": "agv_ncs",  # the same bytes for the same run
 }
 
-COLOURS = {REFERENCE: "#7f7f7f", DRIVEN: "#1f6fb4", LOST: "#d62728", OTHER: "#e08214", LIMIT: "black", PEAK: "#7b3fb5"}
+COLOURS = {
+    REFERENCE: "#7f7f7f", DRIVEN: "#1f6fb4", LOST: "#d62728", OTHER: "#e08214", LIMIT: "black", PEAK: "#7b3fb5",
+    **dict(zip(DEVIATIONS, ("#1f6fb4", "#1b7f6d", "#a9861a", "#c85f17", "#b3157f"), strict=True)),
+}  # fmt: skip
 
 _MOST_POINTS = 4000
 """Points of a line: more than a printer can show in a column."""
@@ -84,8 +89,13 @@ def _draw_line(axes: Axes, line: Line) -> None:
         axes.bar(line.x, line.y, color=colour, label=line.name)
     elif line.style == MARKERS:
         axes.plot(line.x, line.y, ".", color=colour, ms=2.0, label=line.name, rasterized=len(line.x) > _MOST_POINTS)
+    elif line.style == HALOS:
+        axes.plot(line.x, line.y, ".", color=colour, ms=5.0, mew=0.0, alpha=0.25, zorder=1.0, label=line.name)
     elif line.style == RINGS:
         axes.plot(line.x, line.y, "o", color=colour, ms=6.0, mfc="none", mew=0.8, label=line.name)
+        for i, text in enumerate(line.labels):
+            at, place = (line.x[i], line.y[i]), (-5.0, 5.0 if i % 2 == 0 else -10.0)
+            axes.annotate(text, at, place, textcoords="offset points", ha="right", fontsize=5.0, color=colour)
     elif line.style == STEP:
         axes.step(line.x, line.y, where="post", color=colour, lw=0.6, label=line.name)
     else:

@@ -1,15 +1,17 @@
 """The report: one HTML file that needs no network, the verdict first.
 
-Every string goes through the template's escaping, and what goes into a script is JSON without any `<`. The page's
-content security policy forbids loading anything.
+Every string goes through the template's escaping, and what goes into a script is JSON without any `<`, or base64. The
+page's content security policy forbids loading anything.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
+import math
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +20,16 @@ import numpy as np
 
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
 from agv_analysis.output_file import output_file
+from agv_analysis.report.cannot_say import cannot_say
 from agv_analysis.report.corridor_panels import corridor_panel, edges
-from agv_analysis.report.panels import TIME, Panel, panels, to_json
-from agv_analysis.report.plotly import MOST_POINTS, figure
+from agv_analysis.report.packed import packed_figures, packed_text
+from agv_analysis.report.panels import TIME, Panel, panels, to_json, within_reach
+from agv_analysis.report.parameter_lines import changed_parameters, parameter_lines
+from agv_analysis.report.plotly import MOST_POINTS, aspect, figure, packed_values
+from agv_analysis.report.tiles import tiles
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.run import Run
+from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.reference import reference_of
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.version import version
@@ -31,8 +38,17 @@ from agv_ros.errors import UserError
 _FEW = 2000
 """Points of a line in the numbers that the page offers as JSON."""
 
-_HEIGHTS = {"time": 820}
-_HEIGHT = 460
+_HEIGHT, _HEIGHT_OF_TIME = 460, 860
+"""Of plots [pixels]."""
+
+_TRACK_WIDTH = 480
+"""Of the track [pixels] where the time panels are beside it."""
+
+_UPRIGHT = 0.6
+"""Height over width from which on a track has the time panels beside it, not below."""
+
+_CURSOR_PLACES = 5000
+"""Places of a run at which the cursor over time is shown on the track."""
 
 
 def write_report(analysis: Observations, path: str | Path, within: CorridorOfRun | None = None) -> None:
@@ -53,23 +69,27 @@ def write_page(html: str, path: Path) -> None:
 
 def render(analysis: Observations, within: CorridorOfRun | None = None) -> str:
     """The report of a run as HTML. Raises UserError if plotly or jinja2 is not installed."""
-    drawn, figures = all_panels(analysis, within), dict(_rows(analysis))
+    drawn, figures, run = all_panels(analysis, within), dict(_rows(analysis)), analysis.run
     if within is not None:
         figures |= dict(within.rows())
     return fill(
         "report.html.j2",
         figures={key: figure(group) for key, _, group in _groups(drawn)},
+        cursor=_cursor(run),
+        scenario=run.scenario,
         data=report_json(analysis, drawn) | ({} if within is None else {"corridor": within.to_json()}),
-        title=f"agv_ncs: {analysis.run.source}",
+        title=f"agv_ncs: {run.source}",
         verdict=sentence(analysis),
-        word=analysis.verdict.word if isinstance(analysis, Analysis) and not analysis.run.unexplained else "unknown",
+        word=analysis.verdict.word if isinstance(analysis, Analysis) and not run.unexplained else "unknown",
+        why=analysis.verdict.reason if isinstance(analysis, Analysis) and not run.unexplained else "",
+        tiles=list(tiles(analysis, within)),
+        cannot_say=list(cannot_say(analysis, within)),
         analysis=analysis,
-        run=analysis.run,
+        run=run,
         rows=list(figures.items()),
-        deviation=figures["Deviation"],
         margins=list(_margins(analysis)),
         sections=list(_sections(drawn)),
-        parameters=analysis.run.scenario.to_yaml(),
+        parameters=run.scenario.to_yaml(),
         reproduce=_reproduce(analysis),
     )
 
@@ -86,10 +106,14 @@ def all_panels(analysis: Observations, within: CorridorOfRun | None = None) -> l
     return [*with_edges, corridor_panel(expected)]
 
 
-def fill(template: str, figures: dict[str, Any], data: dict[str, Any], **content: Any) -> str:
+def fill(
+    template: str, figures: dict[str, Any], data: dict[str, Any], scenario: Scenario, parameters: str,
+    cursor: dict[str, Any] | None = None, **content: Any,
+) -> str:  # fmt: skip
     """A template of this folder, filled. Raises UserError if plotly or jinja2 is not installed.
 
-    `figures` go to plotly.js by the key of their place in the page, `data` is what the page offers to save.
+    `figures` go to plotly.js by the key of their place in the page, `data` is what the page offers to save,
+    `parameters` the params file of the scenario; the `cursor` says where the AGV was at which time.
     """
     try:
         jinja2: Any = importlib.import_module("jinja2")
@@ -98,15 +122,30 @@ def fill(template: str, figures: dict[str, Any], data: dict[str, Any], **content
         raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    # Library and figures are scripts, not text: what goes into one is JSON in which nothing can end it.
+    # Library and figures are packed, and the data is a script: JSON in which nothing can end it.
     text: str = environment.get_template(template).render(
-        library=plotly.get_plotlyjs(),
-        figures=_for_script(figures),
+        library=_library(plotly.get_plotlyjs),
+        packed=packed_figures({"figures": figures, **({} if cursor is None else {"cursor": cursor})}),
         data=_for_script(data),
         versions=versions(),
+        parameter_lines=parameter_lines(scenario, parameters),
+        changed=len(changed_parameters(scenario)),
         **content,
     )
     return text
+
+
+@functools.lru_cache(maxsize=1)
+def _library(source: Callable[[], str]) -> str:
+    """plotly.js, packed: less than half as long."""
+    return packed_text(source())
+
+
+def _cursor(run: Run) -> dict[str, Any]:
+    """Time, and where the AGV was, at some steps evenly spread over a run."""
+    some = slice(None, None, -(-len(run) // _CURSOR_PLACES))
+    x, y = within_reach(run)
+    return {name: packed_values(values[some]) for name, values in (("time", run.time), ("x", x), ("y", y))}
 
 
 def report_json(analysis: Observations, drawn: list[Panel]) -> dict[str, Any]:
@@ -139,7 +178,13 @@ def _groups(drawn: list[Panel]) -> Iterator[tuple[str, str, list[Panel]]]:
 def _sections(drawn: list[Panel]) -> Iterator[dict[str, Any]]:
     for key, title, group in _groups(drawn):
         longest = max(len(line.x) for panel in group for line in panel.lines)
-        yield {"key": key, "title": title, "height": _HEIGHTS.get(key, _HEIGHT), "thinned": longest > MOST_POINTS}
+        height, of_track = _HEIGHT, aspect(group[0]) if key == "track" else math.nan
+        if key == "time":
+            height = _HEIGHT_OF_TIME
+        elif of_track >= _UPRIGHT:  # the time panels are beside it
+            height = int(min(_HEIGHT_OF_TIME, max(_HEIGHT, _TRACK_WIDTH * of_track)))
+        is_upright = of_track >= _UPRIGHT
+        yield {"key": key, "title": title, "height": height, "thinned": longest > MOST_POINTS, "upright": is_upright}
 
 
 def _rows(analysis: Observations) -> Iterator[tuple[str, str]]:

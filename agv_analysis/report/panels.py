@@ -18,10 +18,28 @@ from agv_analysis.stability.analysis import Analysis, Observations
 
 TIME = "time [s]"
 
-LINE, STEP, MARKERS, RINGS, BARS = "line", "step", "markers", "rings", "bars"
+LINE, STEP, MARKERS, HALOS, RINGS, BARS = "line", "step", "markers", "halos", "rings", "bars"
+"""How a line is drawn; halos are wide and faint, and lie under everything else."""
 
 REFERENCE, DRIVEN, LOST, OTHER, LIMIT, PEAK = "reference", "driven", "lost", "other", "limit", "peak"
 """What a line stands for, which gives it its colour."""
+
+DEVIATIONS = tuple(f"deviation {i}" for i in range(5))
+"""The AGV's path by how far it is from the reference, from near to far."""
+
+_BOUNDS = (1e-3, 1e-2, 1e-1, 1.0)
+"""Distances [m] between the colours of DEVIATIONS."""
+
+_NAMES = ("AGV within 1 mm", "within 1 cm", "within 10 cm", "within 1 m", "farther away")
+
+_MOST_STRETCHES = 10_000
+"""Stretches of a run that have a colour each."""
+
+_WILD = 1e3
+"""Errors [m] and speeds [m/s] beyond this are those of a loop that diverges."""
+
+AGV = "AGV"
+"""Name of the line that the AGV drove."""
 
 SMALLEST = 1e-6
 """Errors [m] below this are drawn at it: a logarithm has no zero."""
@@ -46,6 +64,8 @@ class Line:
     style: str = LINE
     slots: Slots | None = None
     """The slot behind each point, where there is one."""
+    labels: tuple[str, ...] = ()
+    """What is written beside each point, where something is."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +84,19 @@ class Panel:
     """What is shown at first; None: everything."""
 
 
-def time_panels(run: Run, worst: tuple[Peak, ...] = ()) -> tuple[Panel, ...]:
-    """Errors, speed and age of the pose over time; the largest deviations are marked."""
-    return distance(run, worst), frame_errors(run), speed(run), age(run)
+def time_panels(run: Run, worst: tuple[Peak, ...] = (), since: float | None = None) -> tuple[Panel, ...]:
+    """Errors, speed and age of the pose over time; the largest deviations are marked.
+
+    What is shown at first is what happens `since` [s], from the first step of the run; None: most of it.
+    """
+    return distance(run, worst), frame_errors(run, since), speed(run, since), age(run)
 
 
 def panels(analysis: Observations) -> Iterator[Panel]:
     """All panels of a run; those that need the controller's gains only where these are known."""
-    worst = analysis.deviation.worst
-    yield track(analysis.run, worst)
-    yield from time_panels(analysis.run, worst)
+    worst, since = analysis.deviation.worst, analysis.deviation.since_seconds
+    yield coloured_by_deviation(track(analysis.run, worst), analysis.run)
+    yield from time_panels(analysis.run, worst, since)
     if analysis.outages.uplink.count:
         yield outage_lengths(analysis)
     if isinstance(analysis, Analysis) and not analysis.infeasible:
@@ -83,20 +106,55 @@ def panels(analysis: Observations) -> Iterator[Panel]:
 def track(run: Run, worst: tuple[Peak, ...] = ()) -> Panel:
     """The track from above, with the places where poses were lost, and those of the largest deviations."""
     reference = run.reference[:, :2]
-    x, y = within(run.pose[:, 0], reference[:, 0]), within(run.pose[:, 1], reference[:, 1])
+    x, y = within_reach(run)
     cause = np.full(len(run), "") if run.uplink is None else run.uplink.cause
     why = Slots(run.k[run.lost], cause[run.lost])
-    lines = [Line("reference", reference[:, 0], reference[:, 1], REFERENCE), Line("AGV", x, y, DRIVEN)]
+    lines = [Line("reference", reference[:, 0], reference[:, 1], REFERENCE), Line(AGV, x, y, DRIVEN)]
     if worst:
         rows = np.searchsorted(run.time, [run.time[0] + peak.seconds for peak in worst])
         lines.append(Line("largest deviations", x[rows], y[rows], PEAK, RINGS))
     if run.lost.any():
-        lines.append(Line("pose lost", x[run.lost], y[run.lost], LOST, MARKERS, why))
+        lines.append(Line("pose lost", x[run.lost], y[run.lost], LOST, HALOS, why))
     return Panel("track", "Track", "x [m]", "y [m]", tuple(lines), equal=True)
 
 
-def within(values: Floats, reference: Floats) -> Floats:
-    """Values that lie within some laps of the reference; what is far away would shrink the track to a point."""
+def coloured_by_deviation(panel: Panel, run: Run) -> Panel:
+    """The track of a run on which the AGV's line is taken apart by how far it was from the reference.
+
+    The farthest lie on top, so that no short excursion is covered.
+    """
+    offset = run.pose[:, :2] - run.reference[:, :2]
+    distances = np.hypot(offset[:, 0], offset[:, 1])
+    lines: list[Line] = []
+    for line in panel.lines:
+        lines += _by_deviation(line, distances) if line.name == AGV else (line,)
+    return replace(panel, lines=tuple(lines))
+
+
+def _by_deviation(line: Line, distances: Floats) -> Iterator[Line]:
+    """Lines by colour, with gaps where another one is drawn; each stretch has the colour of its largest distance."""
+    begins = np.arange(0, len(distances), -(-len(distances) // _MOST_STRETCHES))
+    x, y, colour = line.x[begins], line.y[begins], np.digitize(np.maximum.reduceat(distances, begins), _BOUNDS)
+    for i, (name, role) in enumerate(zip(_NAMES, DEVIATIONS, strict=True)):
+        rows = np.flatnonzero(colour == i)
+        if len(rows):
+            is_last = np.append(np.diff(rows) != 1, True)
+            ends = np.minimum(rows[is_last] + 1, len(x) - 1)  # where the next stretch begins, and then a gap
+            after = np.repeat(np.flatnonzero(is_last) + 1, 2)
+            gaps = np.full(len(ends), np.nan)
+            drawn_x, drawn_y = (
+                np.insert(values[rows], after, np.column_stack((values[ends], gaps)).ravel()) for values in (x, y)
+            )
+            yield Line(name, drawn_x, drawn_y, role)
+
+
+def within_reach(run: Run) -> tuple[Floats, Floats]:
+    """x and y of the AGV [m], shape (N,) each, NaN where it is so far away that the track would shrink to a point."""
+    return _within(run.pose[:, 0], run.reference[:, 0]), _within(run.pose[:, 1], run.reference[:, 1])
+
+
+def _within(values: Floats, reference: Floats) -> Floats:
+    """Values that lie within some laps of the reference."""
     reach = 2.0 * (np.ptp(reference) + 10.0)
     near = np.abs(values - np.mean(reference)) <= reach
     return np.where(near, values, np.nan)
@@ -124,7 +182,7 @@ def distance(run: Run, worst: tuple[Peak, ...] = ()) -> Panel:
     )
 
 
-def frame_errors(run: Run) -> Panel:
+def frame_errors(run: Run, since: float | None = None) -> Panel:
     """The true errors in the AGV's frame."""
     e = body_errors(run.reference, run.pose)
     lines = (
@@ -132,10 +190,10 @@ def frame_errors(run: Run) -> Panel:
         Line("y_e across [m]", run.time, e[:, 1], OTHER),
         Line("theta_e [rad]", run.time, wrapped(e[:, 2]), REFERENCE),
     )
-    return Panel("errors", "Errors in the AGV's frame", TIME, "error [m, rad]", lines, y_range=_most(e))
+    return Panel("errors", "Errors in the AGV's frame", TIME, "error [m, rad]", lines, y_range=_shown(e, run, since))
 
 
-def speed(run: Run) -> Panel:
+def speed(run: Run, since: float | None = None) -> Panel:
     """Commanded speed, the reference's, and the limits."""
     lines = [
         Line("v", run.time, run.command[:, 0], DRIVEN),
@@ -144,7 +202,7 @@ def speed(run: Run) -> Panel:
     v_max = run.scenario.controller.v_max
     if run.gains_known and np.isfinite(v_max):
         lines += [_limit(name, run, limit) for name, limit in (("v_max", v_max), ("-v_max", -v_max))]
-    shown = _most(np.concatenate((run.command[:, 0], run.reference[:, 3])))
+    shown = _shown(np.column_stack((run.command[:, 0], run.reference[:, 3])), run, since)
     return Panel("speed", "Speed", TIME, "speed [m/s]", tuple(lines), y_range=shown)
 
 
@@ -163,6 +221,22 @@ def age(run: Run) -> Panel:
 def _limit(name: str, run: Run, value: float) -> Line:
     ends = run.time[[0, -1]]
     return Line(name, ends, np.full(2, value), LIMIT)
+
+
+def _shown(values: Floats, run: Run, since: float | None) -> tuple[float, float] | None:
+    """The range of a panel at first, of values of shape (N, M): that since the initial error has settled.
+
+    A start far from the track would flatten all the rest. Of a run that does not settle, or diverges, most of it.
+    """
+    if since is None:
+        return _most(values)
+    settled = values[run.time - run.time[0] >= since]
+    finite = settled[np.isfinite(settled)]
+    if not finite.size or np.abs(finite).max() > _WILD:
+        return _most(values)
+    low, high = float(finite.min()), float(finite.max())
+    margin = max(0.05 * (high - low), 0.01 * max(abs(low), abs(high)), 1e-6)
+    return low - margin, high + margin
 
 
 def _most(values: Floats) -> tuple[float, float] | None:
@@ -194,13 +268,23 @@ def unit_circle(analysis: Analysis) -> Panel:
         Line("|z| = 1", np.cos(angle), np.sin(angle), LIMIT),
         Line("lifted system", multipliers.real, multipliers.imag, LOST, MARKERS),
         Line("paper's A(k)", eigenvalues.real, eigenvalues.imag, DRIVEN, MARKERS),
+        *_deciding({"lifted system": multipliers, "paper's A(k)": eigenvalues}),
     )
     title = f"Eigenvalues: the paper's along the run, the lifted system's for a pose always {analysis.n} steps old"
     return Panel("eigenvalues", title, "Re", "Im", lines, equal=True)
 
 
+def _deciding(found: dict[str, NDArray[np.complex128]]) -> Iterator[Line]:
+    """The largest of the eigenvalues of each kind, with its modulus: the one that decides."""
+    largest = {name: values[np.abs(values).argmax()] for name, values in found.items() if len(values)}
+    if largest:
+        z = np.array(list(largest.values()))
+        labels = tuple(f"{name}: |z| = {abs(value):.5g}" for name, value in largest.items())
+        yield Line("largest, which decides", z.real, z.imag, PEAK, RINGS, labels=labels)
+
+
 def thinned(line: Line, most: int) -> Line:
-    """A line of about `most` points at most, which keeps the lowest and the highest of each stretch.
+    """A line of about `most` points at most, which keeps the lowest and the highest of each stretch, and its gaps.
 
     So no peak is lost, however far one zooms out; with `most` pixels the picture is the same.
     """
@@ -213,7 +297,8 @@ def thinned(line: Line, most: int) -> Line:
     is_empty = np.isnan(stretches)
     lowest = begins + np.where(is_empty, np.inf, stretches).argmin(axis=1)
     highest = begins + np.where(is_empty, -np.inf, stretches).argmax(axis=1)
-    kept = np.unique(np.concatenate((lowest, highest, [0, len(line.x) - 1])))
+    gaps = (begins + is_empty.argmax(axis=1))[is_empty.any(axis=1)]
+    kept = np.unique(np.concatenate((lowest, highest, gaps[gaps < len(line.x)], [0, len(line.x) - 1])))
     slots = None if line.slots is None else Slots(*(part[kept] for part in line.slots))
     return replace(line, x=line.x[kept], y=line.y[kept], slots=slots)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from agv_analysis.report.panels import (
     BARS,
+    DEVIATIONS,
     DRIVEN,
+    HALOS,
     LIMIT,
     LOST,
     MARKERS,
@@ -35,6 +38,7 @@ COLOURS = {
     OTHER: "#e39a2d",
     LIMIT: "#8a8a8a",
     PEAK: "#a06cd5",
+    **dict(zip(DEVIATIONS, ("#3b8bd0", "#1f9e89", "#c9a227", "#e0762a", "#d6249f"), strict=True)),
 }
 """Each is seen on white and on black."""
 
@@ -47,6 +51,24 @@ MOST_MARKERS = 5000
 _LONGEST_CAUSE = 60
 """Letters of a cause that are shown, at most."""
 
+_LONGEST = 4.0
+"""A track that is more times as long as broad has axes that show more than it."""
+
+_FEW_LINES = 5
+"""Lines whose names fit above a panel."""
+
+_LEGEND = {"orientation": "h", "x": 0.0}
+_LEGEND_BELOW = {
+    **_LEGEND, "yref": "container", "y": 0.0, "yanchor": "bottom", "entrywidth": 0.5, "entrywidthmode": "fraction",
+    "font": {"size": 11},
+}  # fmt: skip
+"""In two columns."""
+
+_LEGEND_ROW = 19
+"""Its height [pixels]."""
+
+_SPIKE = {"spikethickness": 1, "spikedash": "solid", "spikecolor": "#8a8a8a"}
+
 _GAP = 0.22
 """Share of a row that is left free above it, for its legend."""
 
@@ -57,25 +79,32 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST
     Lines are drawn as vectors: without a graphics card WebGL takes seconds for what they take a tenth of one, and in
     print they stay sharp.
     """
-    rows = len(panels)
+    is_long = len(panels) == 1 and len(panels[0].lines) > _FEW_LINES
+    below = _LEGEND_ROW * -(-len(panels[0].lines) // 2) + 8 if is_long else 0
+    rows, is_track = len(panels), panels[0].equal
     found: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
-        "margin": {"l": 60, "r": 12, "t": 32, "b": 44},
+        "margin": {"l": 60, "r": 12, "t": 32 if rows == 1 else 10, "b": 44 + below},
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "modebar": {"bgcolor": "rgba(0,0,0,0)"},
-        "hovermode": "closest" if panels[0].equal else "x",
+        "hovermode": "closest" if is_track else "x",
         "uirevision": panels[0].key,
         "xaxis": {
             "title": {"text": panels[0].x_label}, "anchor": f"y{rows if rows > 1 else ''}", "zeroline": False,
         },
     }  # fmt: skip
+    if rows > 1:  # one cursor through all of them
+        layout["hoversubplots"] = "axis"
+        layout["xaxis"] |= {"showspikes": True, "spikemode": "across", "spikesnap": "hovered data", **_SPIKE}
+    if is_track and _is_broad(panels[0]):
+        layout["xaxis"]["constrain"] = "domain"
     for row, panel in enumerate(panels):
         number = str(row + 1) if row else ""
         top = 1.0 - row / rows - (_GAP / rows if rows > 1 else 0.0)
         bottom = 1.0 - (row + 1) / rows
         layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel)}
-        layout[f"legend{number}"] = {"orientation": "h", "x": 0.0, "y": top, "yanchor": "bottom"}
+        layout[f"legend{number}"] = _LEGEND_BELOW if is_long else {**_LEGEND, "y": top, "yanchor": "bottom"}
         of_row = {"yaxis": f"y{number}", "legend": f"legend{number}"}
         found += [_trace(line, most, markers) | of_row for line in panel.lines]
     return {"data": found, "layout": layout}
@@ -86,33 +115,62 @@ def traces(lines: Sequence[Line], most: int = MOST_POINTS) -> list[dict[str, Any
     return [_trace(line, most, MOST_MARKERS) | {"yaxis": "y", "legend": "legend"} for line in lines]
 
 
+def aspect(panel: Panel) -> float:
+    """Height of what a panel shows over its width; inf of a line upwards, NaN of a point."""
+    x, y = (np.concatenate([getattr(line, name) for line in panel.lines]) for name in ("x", "y"))
+    width, height = (float(np.nanmax(values) - np.nanmin(values)) for values in (x, y))
+    return height / width if width > 0.0 else math.inf if height > 0.0 else math.nan
+
+
+def _is_broad(panel: Panel) -> bool:
+    """Is it so broad and so high that axes of just its size can be read?"""
+    return 1.0 / _LONGEST < aspect(panel) < _LONGEST
+
+
 def _y_axis(panel: Panel) -> dict[str, Any]:
     axis: dict[str, Any] = {"title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "power"}
     if panel.log:
         axis["type"] = "log"
     if panel.equal:
-        axis |= {"scaleanchor": "x", "scaleratio": 1}
+        axis |= {"scaleanchor": "x", "scaleratio": 1} | ({"constrain": "domain"} if _is_broad(panel) else {})
     if panel.y_range is not None:
         axis["range"] = list(panel.y_range)
     return axis
 
 
 def _trace(line: Line, most: int, markers: int) -> dict[str, Any]:
-    line = thinned(line, markers if line.style == MARKERS else most)
+    line = thinned(line, markers if line.style in (MARKERS, HALOS) else most)
     colour = COLOURS[line.role]
-    trace: dict[str, Any] = {"name": line.name, "x": _packed(line.x), "y": _packed(line.y), "showlegend": True}
+    trace: dict[str, Any] = {
+        "name": line.name,
+        "x": packed_values(line.x),
+        "y": packed_values(line.y),
+        "showlegend": True,
+    }
     if line.style == BARS:
         return {**trace, "type": "bar", "marker": {"color": colour}}
     trace["type"] = "scatter"
-    if line.style == MARKERS:
+    if line.style == HALOS or line.role == OTHER:
+        trace["zorder"] = -1  # under the line that matters
+    if line.style in (MARKERS, HALOS):
         why = {} if line.slots is None else _why(line.slots)
-        return {**trace, "mode": "markers", "marker": {"color": colour, "size": 4}, **why}
+        marker = {"size": 8, "opacity": 0.2} if line.style == HALOS else {"size": 4}
+        return {**trace, "mode": "markers", "marker": {"color": colour, **marker}, **why}
     if line.style == RINGS:
         ring = {"symbol": "circle-open", "size": 14, "color": colour, "line": {"width": 2}}
-        return {**trace, "mode": "markers", "marker": ring}
+        return {**trace, "mode": "markers", "marker": ring, **_labels(line)}
     dash = {"dash": "dash"} if line.role == LIMIT else {}
     shape = {"shape": "hv"} if line.style == STEP else {}
-    return {**trace, "mode": "lines", "line": {"color": colour, "width": 1.5, **dash, **shape}}
+    width = 3 if line.role in DEVIATIONS else 1.5
+    return {**trace, "mode": "lines", "line": {"color": colour, "width": width, **dash, **shape}}
+
+
+def _labels(line: Line) -> dict[str, Any]:
+    """Texts on the left of points, by turns above and below, for they may lie close to each other."""
+    if not line.labels:
+        return {}
+    places = [("top left", "bottom left")[i % 2] for i in range(len(line.labels))]
+    return {"mode": "markers+text", "text": list(line.labels), "textposition": places}
 
 
 def _why(slots: Slots) -> dict[str, Any]:
@@ -129,7 +187,7 @@ def _why(slots: Slots) -> dict[str, Any]:
     return {**steps, "text": [causes[i] for i in of.tolist()], "hovertemplate": place + "%{text}"}
 
 
-def _packed(values: Floats) -> dict[str, str]:
+def packed_values(values: Floats) -> dict[str, str]:
     """Numbers as plotly.js takes them in binary, in single precision, which is finer than a pixel."""
     largest = float(np.finfo(np.float32).max)
     return _binary(np.clip(values, -largest, largest).astype("<f4"), "f4")

@@ -36,6 +36,7 @@ def write_requirements(
         word="infeasible" if found.infeasible else "asymptotic",
         tables=[(title, heads.get(title, ()), rows) for title, rows in sections.items()],
         sections=[{"key": panel.key, "title": panel.title, "height": 360} for panel in _panels(found)],
+        scenario=scenario,
         parameters=parameters,
         reproduce="agv-ncs require params.yaml --report report.html",
     )

@@ -64,6 +64,7 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
         columns=list(plain[0]) if plain else [],
         rows=plain[:_MOST_ROWS],
         left_out=max(0, len(plain) - _MOST_ROWS),
+        scenario=sweep.base,
         parameters=parameters,
         reproduce=command,
     )

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import importlib
 import json
 import re
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,12 +18,14 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.report.cannot_say import cannot_say
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.report.matplotlib_figures import draw_figures
 from agv_analysis.report.page import render, write_report
-from agv_analysis.report.panels import LINE, Line, panels, thinned, track
+from agv_analysis.report.panels import HALOS, LINE, Line, panels, thinned, track
 from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
 from agv_analysis.report.table import print_side_by_side, print_table
+from agv_analysis.report.tiles import confidence_text
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
@@ -96,7 +100,7 @@ def test_all_plots_are_drawn_and_the_console_is_silent(shown: Chrome, lap: Analy
         rings = of_plot(shown, key, "Array.from(plot._fullData.find(trace => trace.name == 'largest deviations').y)")
         assert len(rings) == len(worst)
     np.testing.assert_allclose(rings, worst, rtol=1e-6)
-    assert f"at most {worst[0]:.3g} m" in shown.find_element("id", "deviation").text
+    assert f"{worst[0]:.3g} m" in shown.find_element("id", "deviation").text
     assert len(shown.find_elements("css selector", "#deviations tr")) == 1 + len(worst)
 
 
@@ -106,6 +110,90 @@ def test_the_numbers_in_the_page_are_those_of_the_run(shown: Chrome, lap: Analys
     np.testing.assert_allclose(speed, lap.run.command[:, 0], rtol=1e-6)
     data = json.loads(shown.execute_script("return document.getElementById('data').textContent"))
     assert data["analysis"] == json.loads(json.dumps(lap.to_json()))
+
+
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
+def test_the_first_screen_says_whether_how_far_how_sure_and_why(shown: Chrome, width: int, height: int) -> None:
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+    shown.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        shown.execute_script("scrollTo(0, 0)")
+        for name in ("verdict", "why", "cannot-say", "word", "deviation", "corridor", "losses", "outage", "speed"):
+            rect = shown.execute_script(f"return document.getElementById('{name}').getBoundingClientRect()")
+            assert rect["bottom"] <= height, name
+            assert rect["right"] <= width, name
+        assert "stable with a probability" in shown.find_element("id", "word").text
+    finally:
+        shown.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def point_at(chrome: Chrome, key: str, x: float, y: float | None = None) -> None:
+    """Move the pointer over a place of a plot, in the units of its first axes; y: the middle of its first panel."""
+    from selenium.webdriver import ActionChains
+
+    element = chrome.find_element("id", f"plot-{key}")
+    chrome.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
+    axis = "plot._fullLayout.yaxis"
+    down = f"{axis}._offset + {f'{axis}.l2p({y})' if y is not None else f'{axis}._length / 2'}"
+    right = f"plot._fullLayout.xaxis._offset + plot._fullLayout.xaxis.l2p({x})"
+    left, top = of_plot(chrome, key, f"[{right} - plot.offsetWidth / 2, {down} - plot.offsetHeight / 2]")
+    ActionChains(chrome).move_to_element(element).move_to_element_with_offset(element, left, top).perform()
+
+
+def test_the_cursor_over_time_is_on_the_track_and_the_other_way_round(shown: Chrome, lap: Analysis) -> None:
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    waiting = WebDriverWait(shown, 60.0)
+    point_at(shown, "time", 60.0)
+    waiting.until(lambda c: of_plot(c, "track", "!plot.querySelector('.cursor').hidden"))
+    place = """(() => {
+        const { xaxis, yaxis } = plot._fullLayout, ring = plot.querySelector(".cursor").style;
+        return [xaxis.p2l(parseFloat(ring.left) - xaxis._offset), yaxis.p2l(parseFloat(ring.top) - yaxis._offset)];
+    })()"""
+    seconds = of_plot(shown, "time", "plot._hoverdata[0].x")
+    step = int(np.abs(lap.run.time - seconds).argmin())
+    np.testing.assert_allclose(of_plot(shown, "track", place), lap.run.pose[step, :2], atol=0.05)
+    # one vertical line through all panels, and labels in each
+    assert of_plot(shown, "time", "new Set(plot._hoverdata.map(point => point.yaxis._id)).size") == 4
+    assert of_plot(shown, "time", "plot.querySelector('.hoverlayer .spikeline').getBBox().height") > 600
+    x, y = lap.run.reference[4000, :2].tolist()
+    point_at(shown, "track", x, y)
+    waiting.until(lambda c: abs(of_plot(c, "time", "plot._hoverdata[0].x") - lap.run.time[4000]) < 1.0)
+    assert complaints(shown) == []
+
+
+def test_what_matters_is_shown_at_first_and_a_click_shows_the_rest(shown: Chrome, lap: Analysis) -> None:
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    settled = lap.run.command[lap.run.time >= lap.deviation.since_seconds, 0]
+    low, high = of_plot(shown, "time", "plot._fullLayout.yaxis3.range")
+    assert low < settled.min() < settled.max() < high < 2.0 * settled.max()
+    button = shown.find_element("id", "ranges")
+    shown.execute_script("arguments[0].click()", button)
+    waiting = WebDriverWait(shown, 60.0)
+    waiting.until(lambda c: of_plot(c, "time", "plot._fullLayout.yaxis3.range[1]") > lap.run.command[:, 0].max())
+    shown.execute_script("arguments[0].click()", button)
+    waiting.until(lambda c: of_plot(c, "time", "plot._fullLayout.yaxis3.range") == [low, high])
+
+
+def test_the_page_is_small_beside_its_library(page: Path) -> None:
+    plotly: Any = importlib.import_module("plotly.offline")
+    html = page.read_text()
+    (library,) = re.findall(r'id="library">([^<]*)<', html)
+    assert len(html) - len(library) < 2e6
+    assert len(library) < 0.5 * len(plotly.get_plotlyjs())
+    assert zlib.decompress(base64.b64decode(library)).decode() == plotly.get_plotlyjs()
+
+
+def test_the_parameters_that_are_no_defaults_are_marked(shown: Chrome, lap: Analysis) -> None:
+    assert not shown.find_element("id", "parameters").is_displayed()
+    marked = shown.execute_script("return [...document.querySelectorAll('#parameters mark')].map(m => m.textContent)")
+    # written down in config/outages.yaml, and other than the schema's defaults
+    written = yaml.safe_load((REPOSITORY / "config/outages.yaml").read_text())
+    uplink = {line.split(":")[0].strip() for line in marked if "uplink" in line}
+    assert uplink == {"uplink.model", "uplink.p", "uplink.r"}
+    assert "uplink" in f"{written}"
+    assert f"{len(marked)} differ from the default" in shown.find_element("id", "of-parameters").text
 
 
 def test_dragging_over_one_plot_zooms_all_that_share_its_time(shown: Chrome) -> None:
@@ -242,6 +330,7 @@ def test_a_hostile_recording_is_text_in_its_report(
     show(chromium, tmp_path / "bad.html")
     assert chromium.execute_script("return [typeof window.harm, document.images.length]") == ["undefined", 0]
     assert complaints(chromium) == []
+    chromium.find_element("css selector", "#of-parameters summary").click()
     shown = chromium.execute_script("return document.body.innerText")
     # the topic's name in a note, the parameter, the file's name; nothing else of the recording is in the page
     assert f"/{HOSTILE}/agv/pose: 5 messages are no sampling instant's" in shown
@@ -379,6 +468,60 @@ def test_eigenvalues_that_are_drawn_are_those_that_were_judged(lap: Analysis) ->
     assert np.abs(lifted_multipliers(lap)).max() == pytest.approx(lap.lifted_radius, rel=1e-9)
     assert lap.paper is not None
     assert np.abs(paper_eigenvalues(lap.run)).max() <= lap.paper.radius * (1.0 + 1e-9)
+
+
+def test_the_track_has_the_colour_of_the_deviation(lap: Analysis) -> None:
+    run = lap.run
+    lines = {line.name: line for line in next(iter(panels(lap))).lines}
+    bounds = {"AGV within 1 mm": 1e-3, "within 1 cm": 1e-2, "within 10 cm": 0.1, "within 1 m": 1.0, "farther away": 9e9}
+    assert list(bounds) == [name for name in lines if name in bounds]
+    at = {(x, y): row for row, (x, y) in enumerate(run.pose[:, :2].tolist())}
+    far = np.hypot(*(run.pose[:, :2] - run.reference[:, :2]).T)
+    on_top: dict[int, float] = {}
+    for name, most in bounds.items():
+        x, y = lines[name].x, lines[name].y
+        for i in np.flatnonzero(np.isfinite(x[:-1]) & np.isfinite(x[1:])):
+            first, last = at[x[i], y[i]], at[x[i + 1], y[i + 1]]
+            assert last - first == 2 or last == len(run) - 2  # 20 000 steps are drawn in 10 000 stretches
+            on_top[first] = most
+    expected = {first: min(m for m in bounds.values() if far[first : first + 2].max() < m) for first in on_top}
+    assert on_top == expected
+    assert len(on_top) >= len(run) // 2 - 1
+    assert all(line.style != HALOS or line.name == "pose lost" for line in lines.values())
+
+
+def test_a_thinned_line_keeps_its_gaps() -> None:
+    y = np.sin(np.arange(50_000.0))
+    y[12_345] = y[40_000] = np.nan
+    line = thinned(Line("gaps", np.arange(50_000.0), y, "driven", LINE), 1000)
+    assert np.isnan(line.y).sum() == 2
+
+
+def test_the_eigenvalues_that_decide_are_named(lap: Analysis) -> None:
+    circle = next(panel for panel in panels(lap) if panel.key == "eigenvalues")
+    labels = next(line for line in circle.lines if line.labels).labels
+    assert lap.paper is not None
+    assert labels[0] == f"lifted system: |z| = {lap.lifted_radius:.5g}"
+    assert float(labels[1].split()[-1]) <= lap.paper.radius * (1.0 + 1e-4)
+
+
+def test_what_a_run_leaves_open_is_beside_its_verdict(lap: Analysis) -> None:
+    assert any("the run was simulated" in line for line in cannot_say(lap))
+    sample = read_run(SAMPLE)
+    unknown = list(cannot_say(observe(dataclasses.replace(sample, gains_known=False))))
+    assert any("name its params file with --config" in line for line in unknown)
+    assert any(line.startswith("What follows an outage of more than") for line in unknown)
+    few = analyse(simulate(scenario_of("plant.duration=3.0", "relay.uplink.p=0.05")))
+    open_questions = " ".join(cannot_say(few))
+    if few.verdict.word == "undecided":
+        assert few.verdict.reason in open_questions
+
+
+def test_a_confidence_is_not_rounded_to_certainty() -> None:
+    assert confidence_text(0.99996) == "stable with a probability above 99.9 %"
+    assert confidence_text(0.0000001) == "stable with a probability below 0.1 %"
+    assert confidence_text(1.0) == "stable with a probability of 100 %"
+    assert confidence_text(0.9566) == "stable with a probability of 95.7 %"
 
 
 def test_a_thinned_line_keeps_its_peaks_and_ends() -> None:

@@ -1,0 +1,91 @@
+"""The row of figures under a report's sentence: verdict, deviation, corridor, losses, longest outage, speed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from agv_analysis.corridor.corridor_of_run import CorridorOfRun
+from agv_analysis.report.table import metres
+from agv_analysis.stability.analysis import Analysis, Observations
+from agv_analysis.stability.verdict import GREEN
+
+
+class Tile(NamedTuple):
+    """One figure: what it is, its value, and what goes with it in some words."""
+
+    key: str
+    label: str
+    value: str
+    note: str
+
+
+def tiles(analysis: Observations, within: CorridorOfRun | None = None) -> Iterator[Tile]:
+    """The figures of a run that are asked for first."""
+    run, up, deviation = analysis.run, analysis.outages.uplink, analysis.deviation
+    yield Tile("word", "Verdict", *_word(analysis))
+    worst = next(iter(deviation.worst), None)
+    when = "" if worst is None else f"at {worst.seconds:g} s"
+    if worst is not None and worst.outage is not None:
+        when += f", after an outage of {worst.outage.slots} slots"
+    yield Tile("deviation", "Worst deviation", metres(deviation.largest), when or deviation.reason)
+    yield Tile("corridor", "Corridor", *_corridor(within))
+    outages = f"{up.count} outages, {up.mean_burst:.3g} slots on average" if up.count else "no outage"
+    yield Tile("losses", "Lost updates", f"{100.0 * up.loss_rate:.3g} %", outages)
+    longest = f"{up.longest} slots ({up.longest * run.ts * 1e3:g} ms)"
+    yield Tile("outage", "Longest outage", longest, _guaranteed(analysis))
+    if np.isfinite(deviation.speed):
+        asked = f"asked for at most, turning at {deviation.turn_rate:.3g} rad/s"
+        yield Tile("speed", "Top speed", f"{deviation.speed:.3g} m/s", asked)
+    else:
+        yield Tile("speed", "Top speed", "not recorded", "")
+
+
+def _word(analysis: Observations) -> tuple[str, str]:
+    if analysis.run.unexplained:
+        return "none", "messages are missing"
+    if not isinstance(analysis, Analysis):
+        return "none", "the gains are not known"
+    confidence = analysis.evidence.confidence
+    return analysis.verdict.word, "" if confidence is None else confidence_text(confidence)
+
+
+def confidence_text(probability: float) -> str:
+    """How probable a stable loop is given the losses that were seen; never rounded to certainty."""
+    if 0.999 < probability < 1.0:
+        return "stable with a probability above 99.9 %"
+    if 0.0 < probability < 0.001:
+        return "stable with a probability below 0.1 %"
+    return f"stable with a probability of {100.0 * probability:.3g} %"
+
+
+def _corridor(within: CorridorOfRun | None) -> tuple[str, str]:
+    if within is None:
+        return "none given", "--corridor D asks for it"
+    seen, width = within.seen, f"{within.widths.half_width:g} m"
+    if seen.left:
+        return width, f"left after {seen.left} of {seen.outages} outages"
+    if not seen.largest <= 1.0:
+        return width, "left"
+    return width, f"kept: at most {100.0 * seen.largest:.0f} % of it was used"
+
+
+def _guaranteed(analysis: Observations) -> str:
+    """Which outages are survived in any order."""
+    if not isinstance(analysis, Analysis) or analysis.run.unexplained:
+        return "guaranteed limit: not known"
+    evidence = analysis.evidence
+    if analysis.verdict.word in GREEN and evidence.growth is not None and evidence.growth_of == "mean_square":
+        if evidence.n_bursts is None:
+            return "guaranteed limit: none, any length is survived"
+        if evidence.n_bursts < 0:
+            return "guaranteed limit: not known"
+        return f"guaranteed limit: {'at least ' if evidence.is_least else ''}{evidence.n_bursts} slots"
+    bursts = analysis.judgements.get("bursts")
+    if bursts is None:
+        return "guaranteed limit: not known"
+    if bursts.stable is None:
+        return "guaranteed limit: undecided"
+    return "any sequence up to this length is survived" if bursts.stable else "too long if they come again and again"
