@@ -75,7 +75,7 @@ def render(analysis: Observations, within: CorridorOfRun | None = None) -> str:
     return fill(
         "report.html.j2",
         figures={key: figure(group) for key, _, group in _groups(drawn)},
-        cursor=_cursor(run),
+        more={"cursor": _cursor(run)},
         scenario=run.scenario,
         data=report_json(analysis, drawn) | ({} if within is None else {"corridor": within.to_json()}),
         title=f"agv_ncs: {run.source}",
@@ -108,12 +108,12 @@ def all_panels(analysis: Observations, within: CorridorOfRun | None = None) -> l
 
 def fill(
     template: str, figures: dict[str, Any], data: dict[str, Any], scenario: Scenario, parameters: str,
-    cursor: dict[str, Any] | None = None, **content: Any,
+    more: dict[str, Any] | None = None, **content: Any,
 ) -> str:  # fmt: skip
     """A template of this folder, filled. Raises UserError if plotly or jinja2 is not installed.
 
     `figures` go to plotly.js by the key of their place in the page, `data` is what the page offers to save,
-    `parameters` the params file of the scenario; the `cursor` says where the AGV was at which time.
+    `parameters` the params file of the scenario; scripts find what is in `more` beside the figures.
     """
     try:
         jinja2: Any = importlib.import_module("jinja2")
@@ -125,7 +125,7 @@ def fill(
     # Library and figures are packed, and the data is a script: JSON in which nothing can end it.
     text: str = environment.get_template(template).render(
         library=_library(plotly.get_plotlyjs),
-        packed=packed_figures({"figures": figures, **({} if cursor is None else {"cursor": cursor})}),
+        packed=packed_figures({"figures": figures, **(more or {})}),
         data=_for_script(data),
         versions=versions(),
         parameter_lines=parameter_lines(scenario, parameters),

@@ -10,16 +10,30 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.report.page import fill, versions, write_page
-from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, plain
-from agv_analysis.report.plotly import figure
+from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, distance, plain, thinned
+from agv_analysis.report.plotly import figure, packed_values
+from agv_analysis.report.sweep_table import number, sweep_table
+from agv_analysis.report.table import metres
+from agv_analysis.report.tiles import Tile
+from agv_analysis.simulation.single import simulate, steps_of
 from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE
+from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
-from agv_analysis.sweep.picture import COLOURS, across_and_up, can_draw, draw
-from agv_analysis.sweep.plan import Axis, Sweep
+from agv_analysis.sweep.picture import INSTABILITY_COLOURS, across_and_up, border_colour, can_draw, draw
+from agv_analysis.sweep.plan import Axis, Sweep, varied
 from agv_analysis.sweep.verdicts import counted
 from agv_ros.errors import UserError
 
 _MOST_ROWS = 500
+
+_MOST_LAP_STEPS = 10_000_000
+"""Steps of all laps that are simulated again for the page, some seconds; of a sweep that has more none is."""
+
+_MOST_LAPS = 400
+"""Points with a lap in the page."""
+
+_LAP_POINTS = 300
+"""Points of a lap in the page: the lowest and the highest of each two pixels."""
 
 Rows = list[dict[str, Any]]
 
@@ -29,7 +43,7 @@ def sweep_sentence(rows: Rows) -> str:
     if not rows:
         return "No point of the sweep was run."
     short = sum(row.get("undecided", 0) > 0 for row in rows)
-    calm = sum(row["unstable"] == 0 and not row.get("undecided") and _is_green(row) for row in rows)
+    calm = sum(_is_calm(row) for row in rows)
     bad = sum(row["unstable"] == row["runs"] for row in rows)
     if calm == len(rows):
         return f"The loop is stable in every run at all {len(rows)} points."
@@ -37,8 +51,9 @@ def sweep_sentence(rows: Rows) -> str:
     return f"Of {len(rows)} points the loop is stable in every run at {calm}, and in none at {bad}{too_short}."
 
 
-def _is_green(row: dict[str, Any]) -> bool:
-    return row.get("verdict", MEAN_SQUARE) in GREEN
+def _is_calm(row: dict[str, Any]) -> bool:
+    is_green = row.get("verdict", MEAN_SQUARE) in GREEN
+    return row["unstable"] == 0 and not row.get("undecided") and is_green
 
 
 def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> None:
@@ -46,13 +61,18 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
     drawn = {"instability": sweep_figure(sweep, rows)} if rows and can_draw(sweep) else {}
     plain = [{name: _plain(value) for name, value in row.items()} for row in rows]
     parameters = sweep.base.to_yaml(of_all_parts=True)
+    heads, cells = sweep_table(sweep, rows)
+    laps = list(_laps(sweep, rows))
     html = fill(
         "sweep.html.j2",
         figures=drawn,
+        more={"laps": laps},
         data={
             "sentence": sweep_sentence(rows),
             "words": counted(rows),
+            "axes": [axis.name for axis in (across_and_up(sweep) if len(sweep.axes) == 2 else sweep.axes)],
             "points": plain,
+            "commands": [_command_of(sweep, row) for row in rows],
             "parameters": parameters,
             "versions": versions(),
         },
@@ -60,15 +80,64 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
         verdict=sweep_sentence(rows),
         word="unknown",
         words=counted(rows),
+        tiles=list(_tiles(sweep, rows)),
         sections=[{"key": key, "title": "Probability of instability", "height": 520} for key in drawn],
-        columns=list(plain[0]) if plain else [],
-        rows=plain[:_MOST_ROWS],
+        axes=[(axis.name, axis_words(axis, sweep.base)) for axis in sweep.axes],
+        has_laps=any(laps),
+        chosen=rows.index(_best(rows)) if rows else -1,
+        heads=heads,
+        rows=cells[:_MOST_ROWS],
         left_out=max(0, len(plain) - _MOST_ROWS),
+        columns=len(plain[0]) if plain else 0,
         scenario=sweep.base,
         parameters=parameters,
         reproduce=command,
     )
     write_page(html, path)
+
+
+def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
+    """What is asked first of a sweep."""
+    if not rows:
+        return
+    calm = [row for row in rows if _is_calm(row)]
+    yield Tile("stable", "Stable in every run", f"{len(calm)} of {len(rows)} points", "")
+    if calm:
+        best = _best(rows)
+        where = ", ".join(f"{axis.name} {number(best[axis.name])}" for axis in sweep.axes)
+        yield Tile("deviation", "Smallest worst deviation", metres(best["deviation_max_p50"]), f"at {where} (median)")
+        sure = max(row["instability_high"] for row in calm)
+        said = f"{calm[0]['runs']} runs at a point: fewer than this are unstable, with 95 % confidence"
+        yield Tile("sure", "How sure", f"{100.0 * sure:.3g} %", said)
+
+
+def _best(rows: Rows) -> dict[str, Any]:
+    """The point with the smallest worst deviation, of those that are stable if there are some."""
+    found = [row for row in rows if _is_calm(row)] or rows
+    return min(found, key=lambda row: (math.isnan(row["deviation_max_p50"]), row["deviation_max_p50"]))
+
+
+def _laps(sweep: Sweep, rows: Rows) -> Iterator[dict[str, Any] | None]:
+    """The distance to the reference over the run of each point's first seed; None where it is left out."""
+    scenarios = [varied(sweep.base, sweep.axes, [row[axis.name] for axis in sweep.axes]) for row in rows]
+    if len(rows) > _MOST_LAPS or sum(map(steps_of, scenarios)) > _MOST_LAP_STEPS:
+        return
+    for scenario in scenarios:
+        try:
+            line = thinned(distance(simulate(scenario)).lines[0], _LAP_POINTS)
+        except UserError:  # the sweep's own runs have said why
+            yield None
+        else:
+            yield {"time": packed_values(line.x), "distance": packed_values(line.y)}
+
+
+def _command_of(sweep: Sweep, row: dict[str, Any]) -> str:
+    settings = " ".join(f"--set {axis.name}={_literal(row[axis.name])}" for axis in sweep.axes)
+    return f"agv-ncs simulate params.yaml {settings} --report lap.html"
+
+
+def _literal(value: Any) -> str:
+    return ".inf" if value == math.inf else str(value)
 
 
 def sweep_figure(sweep: Sweep, rows: Rows) -> dict[str, Any]:
@@ -81,9 +150,14 @@ def sweep_figure(sweep: Sweep, rows: Rows) -> dict[str, Any]:
 def _curve(sweep: Sweep, axis: Axis, rows: Rows) -> dict[str, Any]:
     rows = sorted(rows, key=lambda row: float(row[axis.name]))
     x = np.array([row[axis.name] for row in rows], dtype=np.float64)
-    names = (("instability", DRIVEN), ("instability_low", LIMIT), ("instability_high", LIMIT))
-    lines = tuple(Line(name, x, np.array([row[name] for row in rows]), role) for name, role in names)
-    found = figure([Panel("instability", "Instability", axis.label, "probability", lines, y_range=(-0.02, 1.02))])
+    names = (
+        ("instability", "probability of instability", DRIVEN), ("instability_low", "at least, 95 % confidence", LIMIT),
+        ("instability_high", "at most, 95 % confidence", LIMIT),
+    )  # fmt: skip
+    lines = tuple(Line(label, x, np.array([row[name] for row in rows]), role) for name, label, role in names)
+    words = axis_words(axis, sweep.base)
+    found = figure([Panel("instability", "Instability", words, "probability", lines, y_range=(-0.02, 1.02))])
+    found["data"][0]["mode"] = "lines+markers"
     for name, places in border_places(sweep.base, axis).items():
         if places:
             x_border = [x for place in places for x in (place, place, None)]
@@ -94,16 +168,25 @@ def _curve(sweep: Sweep, axis: Axis, rows: Rows) -> dict[str, Any]:
 def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
     across, up = across_and_up(sweep)
     x_values, y_values = sorted(across.values), sorted(up.values)
-    places = {(row[across.name], row[up.name]): _plain(row["instability"]) for row in rows}
-    z = [[places.get((i, j)) for i in x_values] for j in y_values]
-    heat = {"type": "heatmap", "x": x_values, "y": y_values, "z": z, "zmin": 0.0, "zmax": 1.0}
+    found = {(row[across.name], row[up.name]): row for row in rows}
+    cells = [[found.get((i, j), {}) for i in x_values] for j in y_values]
+    words = axis_words(across, sweep.base), axis_words(up, sweep.base)
+    heat = {
+        "type": "heatmap", "x": x_values, "y": y_values, "zmin": 0.0, "zmax": 1.0,
+        "colorscale": [[place, colour] for place, colour in zip((0.0, 0.5, 1.0), INSTABILITY_COLOURS, strict=True)],
+        "z": [[_plain(cell.get("instability")) for cell in line] for line in cells],
+        "text": [[cell.get("verdict", "") for cell in line] for line in cells],
+        "hovertemplate": f"{words[0]}: %{{x}}<br>{words[1]}: %{{y}}<br>probability of instability: %{{z}}<br>%{{text}}"
+        "<extra></extra>",
+        "colorbar": {"title": {"text": "probability of instability", "side": "right"}, "thickness": 14},
+    }  # fmt: skip
     layout = {
-        "xaxis": {"title": {"text": across.label}}, "yaxis": {"title": {"text": up.label}},
+        "xaxis": {"title": {"text": words[0]}}, "yaxis": {"title": {"text": words[1]}},
         "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
         "margin": {"l": 60, "r": 12, "t": 32, "b": 44},
         "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
     }  # fmt: skip
-    return {"data": [{**heat, "colorscale": "Viridis"}, *_borders(sweep, across, up)], "layout": layout}
+    return {"data": [heat, *_borders(sweep, across, up)], "layout": layout}
 
 
 def _borders(sweep: Sweep, across: Axis, up: Axis) -> Iterator[dict[str, Any]]:
@@ -116,7 +199,7 @@ def _borders(sweep: Sweep, across: Axis, up: Axis) -> Iterator[dict[str, Any]]:
 
 
 def _border(name: str, kind: str, x: Any, y: Any) -> dict[str, Any]:
-    line = {"color": COLOURS[name], "dash": "dash", "width": 2}
+    line = {"color": border_colour(name), "dash": "dash", "width": 2}
     return {
         "type": kind, "name": f"border: {name}", "x": x, "y": y, "line": line, "showlegend": True, "hoverinfo": "skip",
     }  # fmt: skip

@@ -9,6 +9,7 @@
     verdicts  the word on each point, by the rules of `agv-ncs stability`
     rows_file rows as CSV or Parquet
     borders   where the loop ceases to be stable along a straight track, by theory
+    axis_words what the axes are called for people
     picture   curve or heat map of a metric, with these borders
 
 Seeds are paired: under one seed all points with the same channel meet the same outages.

@@ -9,14 +9,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agv_analysis.output_file import output_file
+from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.plan import Axis, Sweep, SweepError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COLOURS = {"mean square": "#d62728", "almost surely": "#ff9f1c"}
-"""Of the borders of stability, by name."""
+_COLOURS = ("#8a8a8a", "#0a8f6a", "#b8860b", "#2f6fdb", "#7b3fb5", "#d6249f")
+
+INSTABILITY_COLOURS = ("#d8efe0", "#f3c77a", "#c0392b")
+"""From a probability of instability of 0 to 1: the lines of all borders are seen on each, and each is seen in grey."""
+
+
+def border_colour(name: str) -> str:
+    """Colour of a border of stability, by the place of its criterion among those that have one."""
+    from agv_analysis.stability.criteria import CRITERIA
+
+    names = [criterion.border.name for criterion in CRITERIA if criterion.border is not None]
+    return _COLOURS[names.index(name) % len(_COLOURS)]
 
 
 def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path) -> None:
@@ -62,25 +73,30 @@ def _curve(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) ->
         axes.fill_between(x, low, high, color="#1f6fb4", alpha=0.2, label="95 % confidence")
     for name, places in border_places(sweep.base, axis).items():
         for place in places:
-            axes.axvline(place, color=COLOURS[name], ls="--", label=f"border: {name}")
-    axes.set(xlabel=axis.label, ylabel=_title(metric))
+            axes.axvline(place, color=border_colour(name), ls="--", label=f"border: {name}")
+    axes.set(xlabel=axis_words(axis, sweep.base), ylabel=_title(metric))
     axes.legend(fontsize="small")
 
 
 def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) -> Any:
+    from matplotlib.colors import LinearSegmentedColormap
+
     across, up = across_and_up(sweep)
     x, y = sorted(across.values), sorted(up.values)
     places = {(row[across.name], row[up.name]): row[metric] for row in rows}
     heat = np.array([[places.get((i, j), np.nan) for i in x] for j in y], dtype=np.float64)
     heat[np.isinf(heat)] = np.nan
     low, high = (0.0, 1.0) if metric == "instability" else (None, None)
-    image = axes.pcolormesh(x, y, heat, shading="nearest", cmap="viridis", vmin=low, vmax=high)
+    colours: Any = "viridis"
+    if metric == "instability":
+        colours = LinearSegmentedColormap.from_list("instability", INSTABILITY_COLOURS)
+    image = axes.pcolormesh(x, y, heat, shading="nearest", cmap=colours, vmin=low, vmax=high)
     *fine, found = border_maps(sweep.base, across, up)
     for name, margin in found.items():
-        axes.contour(*fine, np.ma.masked_invalid(margin), levels=[0.0], colors=COLOURS[name], linestyles="--")
-        axes.plot([], [], color=COLOURS[name], ls="--", label=f"border: {name}")
+        axes.contour(*fine, np.ma.masked_invalid(margin), levels=[0.0], colors=border_colour(name), linestyles="--")
+        axes.plot([], [], color=border_colour(name), ls="--", label=f"border: {name}")
         axes.legend(loc="upper right", fontsize="small")
-    axes.set(xlabel=across.label, ylabel=up.label)
+    axes.set(xlabel=axis_words(across, sweep.base), ylabel=axis_words(up, sweep.base))
     return image
 
 

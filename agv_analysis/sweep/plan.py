@@ -43,12 +43,6 @@ class Axis:
         """The parameter as `--vary` and the columns of the results name it: controller.kx."""
         return f"{self.node}.{self.parameter}"
 
-    @property
-    def label(self) -> str:
-        """The parameter with its unit, for people."""
-        unit = known_parameters()[self.node][self.parameter].unit
-        return f"{self.name} [{unit}]" if unit else self.name
-
 
 def known_parameters() -> Mapping[str, KnownParameters]:
     """What each node of a loop has of parameters, by their names."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from agv_analysis.json_values import finite
+from agv_analysis.link.markov_channel import renewal_chain
+from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.criteria.criterion import (
     PLACES_OF_LONG_LAP,
+    Border,
     Criterion,
     Judgement,
     MapColumn,
@@ -20,9 +24,13 @@ from agv_analysis.stability.criteria.criterion import (
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margin_map_points import LIMIT, largest_repeated_bursts
+from agv_analysis.stability.scenario_loop import straight_loop_of
 
 LONGEST, LONGEST_PREDICTED = 1000, 200
 """Longest bursts [slots] that are tried; fewer behind a predictor, where nothing ends the search early."""
+
+BURST = "burst"
+"""The channel whose outages all have one length."""
 
 ALONG, ACROSS = "along", "across"
 
@@ -117,6 +125,23 @@ def _of_loop(loop: LinearLoop) -> int:
     return LIMIT if refuted is None else refuted - 1
 
 
+def _border(scenario: Scenario) -> float:
+    """Outages of the channel `burst` [slots], less the longest that are survived along a straight track at 1 m/s.
+
+    There a burst of n slots is survived while T_s K_x (n + 1) < 2. NaN for channels without a longest outage, and
+    where the loop has no closed form.
+    """
+    uplink, loop = scenario.relay.uplink, straight_loop_of(scenario)
+    comes_again = uplink.model == BURST and uplink.start_step < 0
+    if not comes_again or renewal_chain(scenario.relay) is None or loop is None or loop.predicts:
+        return math.nan
+    if loop.closed_form is None:
+        return math.nan
+    _, across = joint_spectral_radius.largest_n_straight(loop)
+    along = (uplink.n + 1) * loop.ts * loop.closed_form.kx - 2.0
+    return along if across is None else max(along, uplink.n - across - 0.5)
+
+
 CRITERION = Criterion(
     key="bursts",
     order=30,
@@ -127,5 +152,6 @@ CRITERION = Criterion(
     margins=_margins,
     margin_names=(("n_max.bursts", "Any outages up to n"),),
     at_once=_at_once,
+    border=Border("any outages up to n", _border),
     map_column=MapColumn("n_bursts", "largest repeated burst n", largest_repeated_bursts, _of_loop),
 )

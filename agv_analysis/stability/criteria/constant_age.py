@@ -8,9 +8,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from agv_analysis.json_values import finite
+from agv_analysis.scenario import Scenario
 from agv_analysis.stability import floquet, lifted
 from agv_analysis.stability.criteria.criterion import (
     PLACES_OF_LONG_LAP,
+    Border,
     Criterion,
     Judgement,
     MapColumn,
@@ -23,9 +25,14 @@ from agv_analysis.stability.criteria.criterion import (
 from agv_analysis.stability.first_border import stable_again
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margin_map_points import LIMIT, largest_delays
+from agv_analysis.stability.scenario_loop import straight_loop_of
+from agv_plant.parameters import ChannelParameters
 
 LONGEST, LONGEST_PREDICTED = 10_000, 1000
 """Longest constant delay [steps] that is tried; shorter behind a predictor, where each takes longer."""
+
+_ROUNDING = 1e-9
+"""A delay this much [steps] over whole steps is whole."""
 
 _PLACES = 100
 """Places of the track that are asked at once: all of them would take longer than the lap."""
@@ -99,6 +106,20 @@ def _of_loop(loop: LinearLoop) -> int:
     return LIMIT if found is None else found
 
 
+def _border(scenario: Scenario) -> float:
+    """Age of each pose [steps] less the critical one along a straight track at 1 m/s.
+
+    NaN where the age is not one constant delay of the uplink, and where the loop has no closed form.
+    """
+    uplink, downlink, loop = scenario.relay.uplink, scenario.relay.downlink, straight_loop_of(scenario)
+    is_late_alone = uplink.delay > 0.0 and uplink.jitter == 0.0 and uplink.model == "perfect" and not uplink.schedule
+    if not is_late_alone or downlink != ChannelParameters() or loop is None or loop.predicts:
+        return math.nan
+    if loop.closed_form is None:
+        return math.nan
+    return math.ceil(uplink.delay / scenario.plant.ts - _ROUNDING) - lifted.critical_delay(loop)
+
+
 CRITERION = Criterion(
     key="lifted",
     order=20,
@@ -109,5 +130,6 @@ CRITERION = Criterion(
     margins=_margins,
     margin_names=(("n_max.lifted", "Pose always n steps old"), ("delay_margin", "Delay margin, straight track")),
     at_once=_at_once,
+    border=Border("pose always n steps old", _border),
     map_column=MapColumn("n_lifted", "largest constant n", largest_delays, _of_loop),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import paper
 from agv_analysis.stability.criteria.criterion import (
+    Border,
     Criterion,
     Judgement,
     Margin,
@@ -99,6 +101,14 @@ def _at_once(facts: RunFacts) -> Iterable[Row]:
         yield "Paper's test", "fails even without outages" if n < 0 else f"holds for up to {n} outages in a row"
 
 
+def _border(scenario: Scenario) -> float:
+    """Spectral radius of A(k) along a straight track at 1 m/s, less 1, whatever the losses; NaN for another loop."""
+    if not applies_to(scenario):
+        return math.nan
+    straight = np.zeros(1)
+    return float(paper.spectral_radii(straight, straight, np.ones(1), scenario.controller, scenario.plant.ts)[0]) - 1.0
+
+
 CRITERION = Criterion(
     key="paper",
     order=10,
@@ -109,4 +119,5 @@ CRITERION = Criterion(
     margins=_margins,
     margin_names=(("n_max.paper", "Paper's test, constant n_ul"),),
     at_once=_at_once,
+    border=Border("paper's test", _border),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import dataclasses
 import importlib
 import json
@@ -30,6 +31,7 @@ from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import Analysis, analyse, observe
+from agv_analysis.sweep import METRICS
 from agv_analysis.sweep.plan import Sweep, parse_axis
 from agv_ros.errors import UserError
 
@@ -580,6 +582,25 @@ def test_a_sweep_has_a_report(
     assert verdict == f"Of {points} points the loop is stable in every run at {half}, and in none at {half}."
     assert of_plot(chromium, "instability", "plot._fullData[0].type") == kind
     assert len(chromium.find_elements("css selector", "#points tr")) == points + 1
+    assert len(chromium.find_elements("css selector", "#points th")) <= 10
+    # a click on a point shows it, with its lap: here at the first value of each axis
+    click = "(plot.emit('plotly_click', {points: [{x: 25, y: 0}]}), 1)"
+    of_plot(chromium, "instability", click)
+    assert "--set controller.kx=25.0" in chromium.find_element("id", "point-command").text
+    first = chromium.find_element("css selector", "#points tr.chosen")
+    values = [cell.text for cell in first.find_elements("css selector", "td")]
+    assert [c.text for c in chromium.find_elements("css selector", "#point-values td")] == values
+    settings = ["controller.kx=25.0", *(["relay.uplink.p=0.0"] if len(axes) == 2 else []), "plant.duration=5.0"]
+    run = simulate(scenario_of(*settings))
+    drawn = of_plot(chromium, "lap", "Array.from(plot.data[0].y)")
+    far = np.hypot(*(run.pose[:, :2] - run.reference[:, :2]).T)
+    assert (max(drawn), drawn[-1]) == pytest.approx((far.max(), max(far[-1], 1e-6)), rel=1e-5)
+    saved = chromium.execute_script("window.save = (name, text) => { window.saved = text }; return 1")
+    assert saved == 1
+    chromium.find_element("id", "save-csv").click()
+    table = list(csv.DictReader(chromium.execute_script("return window.saved").splitlines()))
+    assert len(table) == points
+    assert {"controller.kx", "iae_p95", "version"} <= set(table[0])
     assert (tmp_path / "instability.svg").is_file()
 
 
@@ -590,7 +611,14 @@ def swept(*axes: str) -> Sweep:
 
 def calm(sweep: Sweep) -> list[dict[str, Any]]:
     """Rows of a sweep that nobody has run: what is stable does not matter here."""
-    told = {"instability": 0.0, "instability_low": 0.0, "instability_high": 1.0, "unstable": 0, "runs": 1}
+    told: dict[str, Any] = {
+        "instability": 0.0,
+        "instability_low": 0.0,
+        "instability_high": 1.0,
+        "unstable": 0,
+        "runs": 1,
+    }
+    told |= {f"{metric}_{quantile}": 0.0 for metric in METRICS for quantile in ("p50", "p95")}
     names = [axis.name for axis in sweep.axes]
     return [dict(zip(names, sweep.values(i), strict=True)) | told for i in range(sweep.size)]
 
@@ -601,7 +629,7 @@ def test_theory_s_border_is_drawn_in_a_sweep_s_map(chromium: Chrome, tmp_path: P
     show(chromium, tmp_path / "s.html")
     assert complaints(chromium) == []
     names = of_plot(chromium, "instability", "plot.data.map(trace => trace.name)")
-    assert names[1:] == ["border: mean square", "border: almost surely"]
+    assert names[1:] == ["border: mean square", "border: almost surely"]  # the others have none here
     # points of the line as it is drawn, back from pixels to the axes' units
     script = """(() => {
         const { xaxis, yaxis } = plot._fullLayout, path = plot.querySelector(".contourlevel path");

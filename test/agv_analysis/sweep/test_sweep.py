@@ -21,7 +21,8 @@ from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.report.sweep_page import sweep_sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
-from agv_analysis.sweep.borders import margins
+from agv_analysis.sweep.axis_words import axis_words
+from agv_analysis.sweep.borders import border_places, margins
 from agv_analysis.sweep.collect import collect
 from agv_analysis.sweep.execute import Results, on_dask, on_this_machine, run_part
 from agv_analysis.sweep.picture import draw
@@ -205,7 +206,46 @@ def test_a_border_is_that_of_the_true_speed() -> None:
 )
 def test_theory_is_silent_on_what_it_does_not_cover(settings: tuple[str, ...]) -> None:
     base = load_scenario(PAPER, (*BERNOULLI, *settings))
-    assert all(np.isnan(found).all() for found in margins(base, (parse_axis("controller.kx=1,2"),), [(1.0,)]).values())
+    found = margins(base, (parse_axis("controller.kx=1,2"),), [(1.0,)])
+    assert all(np.isnan(found[name]).all() for name in ("mean square", "almost surely", "any outages up to n"))
+
+
+def test_the_borders_of_the_other_criteria_are_where_theory_has_them() -> None:
+    """Along a line, by K_x: the paper's test ends at 2 / T_s whatever is lost, bursts at (n + 1) a = 2, and a constant
+    delay where a = 2 sin(pi / (2 (2n + 1)))."""
+    axis = parse_axis("controller.kx=2:420:3")
+    straight = ("error_detector.track=line", "relay.uplink.model=perfect")
+    assert border_places(load_scenario(PAPER, straight), axis)["paper's test"] == pytest.approx([400.0], abs=6.0)
+    bursts = load_scenario(PAPER, (*straight, "relay.uplink.model=burst", "relay.uplink.n=4"))
+    found = border_places(bursts, axis)
+    assert found["any outages up to n"] == pytest.approx([80.0], abs=6.0)
+    assert found["pose always n steps old"] == []
+    late = load_scenario(PAPER, (*straight, "relay.uplink.delay=0.02"))
+    found = border_places(late, axis)
+    assert found["pose always n steps old"] == pytest.approx([400.0 * np.sin(np.pi / 18.0)], abs=6.0)
+    assert found["any outages up to n"] == []
+
+
+@pytest.mark.parametrize(
+    ("axis", "model", "words"),
+    [
+        ("controller.kx=1,2", "perfect", "gain K_x of the error along the track [1/s]"),
+        ("relay.uplink.p=0.1,0.2", "gilbert_elliott", "uplink: probability of good to bad, per slot"),
+        ("relay.uplink.p=0.1,0.2", "bernoulli", "uplink: loss probability"),
+        ("relay.uplink.p=0.1,0.2", "burst", "uplink: p"),
+        ("relay.uplink.n=1,2", "burst", "uplink: number of consecutive slots lost"),
+        ("plant.ts=0.01,0.02", "perfect", "sampling period T_s [s]"),
+        ("controller.v_max=1.0,2.0", "perfect", "limit on |v| [m/s]"),
+        (
+            "relay.uplink.delay=0.0,0.1",
+            "perfect",
+            "uplink: time under way of a message that is not lost, rounded up to",
+        ),
+    ],
+)
+def test_an_axis_is_named_in_words_with_its_unit(axis: str, model: str, words: str) -> None:
+    base = load_scenario(PAPER, (f"relay.uplink.model={model}",))
+    assert axis_words(parse_axis(axis), base).startswith(words)
 
 
 # -- the same numbers --------------------------------------------------------------------------------------------------
