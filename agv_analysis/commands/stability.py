@@ -45,6 +45,9 @@ _SEEDS = 20
 @click.option("--points", type=click.IntRange(2, 1000), default=100, show_default=True, help="Points of each axis.")
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Where the map goes, map.csv by default.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Where the map is drawn, map.png by default.")
+@click.option(
+    "--report", type=click.Path(path_type=Path), help="With --map: write a page for the browser to this file."
+)
 def command(
     params: str,
     settings: tuple[str, ...],
@@ -57,6 +60,7 @@ def command(
     points: int,
     csv_file: Path | None,
     picture: Path | None,
+    report: Path | None,
 ) -> None:
     """Say how much the loop of the params file PARAMS can take, by each criterion, and where they disagree.
 
@@ -66,7 +70,7 @@ def command(
       agv-ncs stability config/outages.yaml --set controller.kx=5.0 --set error_detector.track=line --json margins.json
       agv-ncs stability config/outages.yaml --corridor 0.25
       agv-ncs stability config/outages.yaml --set error_detector.track=eight --corridor 0.25 --confidence 0.95
-      agv-ncs stability config/paper.yaml --map kx,ts --csv map.csv --picture map.png
+      agv-ncs stability config/paper.yaml --map kx,ts --csv map.csv --picture map.png --report map.html
     """
     from concurrent.futures import ThreadPoolExecutor
 
@@ -87,8 +91,10 @@ def command(
 
     scenario = load_scenario(params, (*settings, *corridor_settings(corridor_width, corridor_along)))
     if axes is not None:
-        _map(scenario, axes, points, csv_file or Path("map.csv"), picture or Path("map.png"))
+        _map(scenario, axes, points, csv_file or Path("map.csv"), picture or Path("map.png"), report)
         return
+    if report is not None:
+        raise click.UsageError("--report is of a map: name its axes by --map; `simulate` reports on a run")
     console = Console(highlight=False)
     seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
     with Console(stderr=True).status("computing the margins ...") as status, ThreadPoolExecutor(1) as beside:
@@ -193,7 +199,7 @@ def _gains_to_json(best: dict[str, GainChoice], why_no_gain: str) -> dict[str, A
     return {"best_kx": {**gains, **reasons}, "best_kx_costs": costs}
 
 
-def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path) -> None:
+def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path, report: Path | None) -> None:
     """Write and draw the map over two axes."""
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.corridor.corridor_map import with_corridor
@@ -212,3 +218,8 @@ def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Pa
     write_csv(csv_file, found)
     draw(picture, found)
     click.echo(f"map:     {csv_file}\npicture: {picture}")
+    if report is not None:
+        from agv_analysis.report.map_page import write_map_page
+
+        write_map_page(found, scenario, report, f"agv-ncs stability params.yaml --map {axes} --points {points}")
+        click.echo(f"report:  {report}")

@@ -13,7 +13,8 @@
     parameter_lines     parameters, and which are not the defaults
     packed              figures as compressed text in a page
     page                the report of a run, one HTML file
-    sweep_page          the report of a sweep
+    sweep_page          the report of a sweep; sweep_table: its ten columns
+    map_page            the page of a map of margins
 
 `panels` says what is drawn; everything that draws walks them.
 """

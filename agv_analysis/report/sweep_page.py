@@ -107,8 +107,8 @@ def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
         where = ", ".join(f"{axis.name} {number(best[axis.name])}" for axis in sweep.axes)
         yield Tile("deviation", "Smallest worst deviation", metres(best["deviation_max_p50"]), f"at {where} (median)")
         sure = max(row["instability_high"] for row in calm)
-        said = f"{calm[0]['runs']} runs at a point: fewer than this are unstable, with 95 % confidence"
-        yield Tile("sure", "How sure", f"{100.0 * sure:.3g} %", said)
+        said = f"by {calm[0]['runs']} runs at each point, with 95 % confidence"
+        yield Tile("sure", "How sure", f"below {100.0 * sure:.3g} % unstable", said)
 
 
 def _best(rows: Rows) -> dict[str, Any]:
@@ -183,7 +183,7 @@ def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
     layout = {
         "xaxis": {"title": {"text": words[0]}}, "yaxis": {"title": {"text": words[1]}},
         "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 60, "r": 12, "t": 32, "b": 44},
+        "margin": {"l": 60, "r": 12, "t": 32, "b": 44}, "modebar": {"bgcolor": "rgba(0,0,0,0)"},
         "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
     }  # fmt: skip
     return {"data": [heat, *_borders(sweep, across, up)], "layout": layout}

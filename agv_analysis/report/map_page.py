@@ -1,0 +1,172 @@
+"""The page of a map of margins: a heat map for each margin, points to click."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agv_analysis.corridor.corridor_map import N_ANY, P_HOUR, TITLES
+from agv_analysis.report.page import fill, versions, write_page
+from agv_analysis.report.panels import plain
+from agv_analysis.report.sweep_table import number
+from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
+from agv_analysis.stability.margin_map import TS, MarginMap, axes_of, map_columns
+from agv_analysis.sweep.picture import INSTABILITY_COLOURS
+from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
+
+_TICKS = (-1, 0, 1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)
+"""Numbers of slots that a colour bar names."""
+
+_COLOURS = ("#2f6fdb", "#7b3fb5", "#0a8f6a", "#b8860b")
+
+_WORDS = {TS: "sampling period T_s", "v": "speed v of the reference", "curvature": "curvature of the track"}
+"""Of axes that are no gains."""
+
+
+def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: str) -> None:
+    """Write the page of a map; `command` repeats it. Raises UserError as `write_report`."""
+    titles = _titles()
+    parameters = scenario.to_yaml(of_all_parts=True)
+    up, across = (axis_in_words(scenario, axis) for axis in found.axes)
+    rows, columns = len(found.first), len(found.second)
+    points = [
+        {found.axes[0]: x, found.axes[1]: y, **{name: n[i, j].item() for name, n in found.margins.items()}}
+        for i, x in enumerate(found.first.tolist())
+        for j, y in enumerate(found.second.tolist())
+    ]
+    html = fill(
+        "map.html.j2",
+        figures={name: _heat_map(found, name, (across, up)) for name in found.margins},
+        data={
+            "sentence": map_sentence(found, scenario), "axes": list(found.axes), "points": points,
+            "titles": {**titles, found.axes[0]: up, found.axes[1]: across},
+            "settings": _settings(scenario), "parameters": parameters, "versions": versions(),
+        },
+        title="agv_ncs: map of margins",
+        verdict=map_sentence(found, scenario),
+        word="unknown",
+        at=f"{rows} by {columns} points about the scenario's own",
+        sections=[{"key": name, "title": _capital(titles[name]), "height": 460} for name in found.margins],
+        chosen=_nearest(found, scenario),
+        scenario=scenario,
+        parameters=parameters,
+        reproduce=command,
+    )  # fmt: skip
+    write_page(html, path)
+
+
+def map_sentence(found: MarginMap, scenario: Scenario) -> str:
+    """What the map says at the point next to the scenario's own, in one sentence."""
+    row = _nearest(found, scenario)
+    i, j = divmod(row, len(found.second))
+    at = f"{found.labels[0]} = {number(found.first[i].item())}, {found.labels[1]} = {number(found.second[j].item())}"
+    said = (f"{title}: {_said(name, found.margins[name][i, j].item())}" for name, title in _shown(found))
+    return f"At {at}, {'; '.join(said)}."
+
+
+def axis_in_words(scenario: Scenario, axis: str) -> str:
+    """What an axis of a map is called, with its unit."""
+    law = CONTROL_LAWS.find(scenario.controller.law)
+    meanings = {known.name: known.description for known in law.parameters}
+    unit = axes_of(scenario)[axis][1]
+    words = _WORDS.get(axis) or meanings.get(axis) or axis
+    return f"{words} [{unit}]" if unit else words
+
+
+def _titles() -> dict[str, str]:
+    return {**{column.name: column.title for column in map_columns()}, **TITLES}
+
+
+def _shown(found: MarginMap) -> Iterator[tuple[str, str]]:
+    titles = _titles()
+    return ((name, titles[name]) for name in found.margins)
+
+
+def _said(name: str, value: float) -> str:
+    if name == P_HOUR:
+        return f"{value:.3g}"
+    outside = "outside" if name == N_ANY else "unstable"
+    return f"{outside} even without outages" if value < 0 else f"{value:g} slots"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _nearest(found: MarginMap, scenario: Scenario) -> int:
+    """Number of the point next to the scenario's own, row by row."""
+    own = axes_of(scenario)
+    i, j = (
+        int(np.abs(values - own[axis][0]).argmin())
+        for axis, values in zip(found.axes, (found.first, found.second), strict=True)
+    )
+    return i * len(found.second) + j
+
+
+def _heat_map(found: MarginMap, name: str, words: tuple[str, str]) -> dict[str, Any]:
+    """A margin over the second axis across and the first one up; the borders of stability of all margins in it."""
+    values = np.asarray(found.margins[name], dtype=np.float64)
+    x, y = found.second.tolist(), found.first.tolist()
+    heat: dict[str, Any] = {"type": "heatmap", "x": x, "y": y, "colorbar": {"thickness": 14}}
+    if name == P_HOUR:
+        scale = [[place, colour] for place, colour in zip((0.0, 0.5, 1.0), INSTABILITY_COLOURS, strict=True)]
+        heat |= {"z": [plain(row) for row in values], "zmin": 0.0, "zmax": 1.0, "colorscale": scale}
+    else:
+        heat |= _by_size(values)
+    heat["text"] = [[_said(name, value) for value in row] for row in values.tolist()]
+    heat["hovertemplate"] = f"{words[0]}: %{{x:.4g}}<br>{words[1]}: %{{y:.4g}}<br>%{{text}}<extra></extra>"
+    layout: dict[str, Any] = {
+        "xaxis": {"title": {"text": words[0]}, **_scale(found.second)},
+        "yaxis": {"title": {"text": words[1]}, **_scale(found.first)},
+        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
+        "margin": {"l": 60, "r": 12, "t": 32, "b": 44}, "modebar": {"bgcolor": "rgba(0,0,0,0)"},
+        "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
+    }  # fmt: skip
+    return {"data": [heat, *_borders(found, x, y)], "layout": layout}
+
+
+def _by_size(values: Floats) -> dict[str, Any]:
+    """Colours by the logarithm of a number of slots, green where many are survived."""
+    size = np.log10(values + 2.0)
+    top = max(1.0, float(size.max()))
+    scale = [[place, c] for place, c in zip((0.0, 0.5, 1.0), reversed(INSTABILITY_COLOURS), strict=True)]
+    ticks = [tick for tick in _TICKS if np.log10(tick + 2.0) <= top]
+    named = {"tickvals": np.log10(np.array(ticks) + 2.0).tolist(), "ticktext": [_tick(tick) for tick in ticks]}
+    return {
+        "z": [plain(row) for row in size], "zmin": 0.0, "zmax": top, "colorscale": scale,
+        "colorbar": {"thickness": 14, "title": {"text": "slots", "side": "right"}, **named},
+    }  # fmt: skip
+
+
+def _tick(slots: int) -> str:
+    return "unstable" if slots < 0 else str(slots)
+
+
+def _scale(values: Floats) -> Mapping[str, Any]:
+    is_wide = values.min() > 0.0 and values.max() >= 10.0 * values.min()
+    return {"type": "log"} if is_wide else {}
+
+
+def _borders(found: MarginMap, x: list[float], y: list[float]) -> Iterator[dict[str, Any]]:
+    """Where the loop ceases to be stable without outages, by each margin that says so here."""
+    for (name, title), colour in zip(_shown(found), _COLOURS, strict=False):
+        values = np.asarray(found.margins[name], dtype=np.float64)
+        if name != P_HOUR and values.min() < 0.0 <= values.max():
+            yield {
+                "type": "contour", "name": f"border: {title}", "x": x, "y": y, "showscale": False, "hoverinfo": "skip",
+                "z": [plain(row) for row in np.clip(values, -1.0, 0.0)], "showlegend": True,
+                "contours": {"start": -0.5, "end": -0.5, "size": 1.0, "coloring": "none"},
+                "line": {"color": colour, "dash": "dash", "width": 2},
+            }  # fmt: skip
+
+
+def _settings(scenario: Scenario) -> dict[str, str]:
+    """The parameter that sets an axis, of those that one parameter sets."""
+    law = scenario.controller.law
+    prefix = "controller" if law == KANAYAMA else f"controller.{law}"
+    gains = {known.name: f"{prefix}.{known.name}" for known in CONTROL_LAWS.find(law).parameters}
+    return {**gains, TS: "plant.ts"}

@@ -1,0 +1,53 @@
+"""The page of a map of margins in headless Chromium: what it says of a point is what the margins say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from test.agv_analysis.report.test_report import complaints, of_plot, show
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+
+def test_a_map_has_a_page_with_points_to_click(
+    chromium: Chrome, agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    page = tmp_path / "map.html"
+    options = ("--csv", tmp_path / "map.csv", "--picture", tmp_path / "map.png", "--report", page)
+    status, said = agv_ncs("stability", "config/paper.yaml", "--map", "kx,ts", "--points", "21", *options)
+    assert status == 0, said
+    show(chromium, page)
+    assert complaints(chromium) == []
+    sentence = chromium.find_element("id", "verdict").text
+    assert "kx [1/s] = 25, ts [s] = 0.005" in sentence
+    assert "largest repeated burst n: 14 slots" in sentence
+    titles = of_plot(chromium, "n_bursts", "[plot._fullLayout.xaxis.title.text, plot._fullLayout.yaxis.title.text]")
+    assert titles == ["sampling period T_s [s]", "gain K_x of the error along the track [1/s]"]
+    data: Any = json.loads(chromium.execute_script("return document.getElementById('data').textContent"))
+    for at in (100, 230, 440):  # row by row: 21 values of T_s for each K_x
+        point = data["points"][at]
+        chosen = f"{{x: {point['ts']!r}, y: {point['kx']!r}}}"
+        of_plot(chromium, "n_bursts", f"(plot.emit('plotly_click', {{points: [{chosen}]}}), 1)")
+        # T_s K_x (n + 1) < 2
+        product, shown = point["ts"] * point["kx"], point["n_bursts"]
+        assert shown == -1 if product >= 2.0 else (shown + 1) * product < 2.0 <= (shown + 2) * product
+        command = chromium.find_element("id", "point-command").text
+        assert (
+            command == f"agv-ncs stability params.yaml --set controller.kx={point['kx']} --set plant.ts={point['ts']}"
+        )
+        cells = [cell.text for cell in chromium.find_elements("css selector", "#point-values td")]
+        assert ("unstable even without outages" if shown == -1 else str(shown)) in cells
+
+
+def test_a_page_without_a_map_is_refused(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    status, said = agv_ncs("stability", "config/paper.yaml", "--report", tmp_path / "map.html")
+    assert status == 2
+    assert "--report is of a map" in said
+    with pytest.raises(FileNotFoundError):
+        (tmp_path / "map.html").read_text()
