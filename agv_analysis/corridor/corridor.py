@@ -21,7 +21,6 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
-from agv_analysis.stability.scenario_loop import loop_on_lap
 
 _PLACES = 500
 """Places of the lap, at least, at which it is asked behind a predictor which repeated outages let an error grow."""
@@ -197,10 +196,13 @@ def corridor(
             progress("a tube for any outages")
             n_proved, tube, covering, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
     progress("laps")
-    found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"))
+    # Noise and slip are not part of what is proved.
+    covered = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else n_proved
+    found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"), covered)
+    stationary, why_not = _stationary(loop)
     return Corridor(
-        widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, *_stationary(loop), found,
-        loop.lap, reason, tuple(_notes(loop, single)),
+        widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, stationary, why_not,
+        found, loop.lap, reason, tuple(_notes(loop, single, stationary)),
     )  # fmt: skip
 
 
@@ -246,7 +248,7 @@ def _tubes(loop: LapLoop, longest: int, second_order: bool = True) -> tuple[int 
     if loop.scenario.controller.steps_ahead:
         return None, None, None, LOOKS_AHEAD
     try:
-        linear = loop_on_lap(loop.scenario)
+        linear = loop.linear
     except NoNominalMotionError as error:
         return None, None, None, str(error)
     if not applies_to(linear):
@@ -267,7 +269,7 @@ def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:
     if scenario.controller.steps_ahead:
         return None, LOOKS_AHEAD
     try:
-        return stationary_deviation(loop, loop_on_lap(scenario), chain), ""
+        return stationary_deviation(loop, loop.linear, chain), ""
     except NoNominalMotionError as error:
         return None, str(error)
 
@@ -280,7 +282,7 @@ def _turns(lengths: list[int]) -> str:
 def _growing(loop: LapLoop, longest: int) -> int | None:
     """Smallest n up to `longest` whose repetition lets a small error grow; None if none does, or if it is not known."""
     try:
-        linear = loop_on_lap(loop.scenario)
+        linear = loop.linear
     except NoNominalMotionError:
         return None
     if linear.is_exact:  # an outage leaves nothing that could grow
@@ -288,7 +290,7 @@ def _growing(loop: LapLoop, longest: int) -> int | None:
     return joint_spectral_radius.first_refuted(linear.thinned(_PLACES) if linear.predicts else linear, longest)
 
 
-def _notes(loop: LapLoop, single: SingleOutage | None) -> Iterator[str]:
+def _notes(loop: LapLoop, single: SingleOutage | None, stationary: StationaryDeviation | None) -> Iterator[str]:
     share, policy = loop.loss_free_share, loop.scenario.error_detector.policy
     if 1.0 < share < _DIVERGED:
         yield f"without any outage the AGV uses {share:.3g} times the half-width: no outage can be survived in it"
@@ -296,6 +298,11 @@ def _notes(loop: LapLoop, single: SingleOutage | None) -> Iterator[str]:
         yield (
             "a single lost pose leads outside: an outdated pose is compared with the reference of now "
             "(error_detector.policy is hold), which align and predict do not do"
+        )
+    if stationary is not None and stationary.has_heavy_tail and math.isfinite(stationary.rms):
+        yield (
+            "the square of the deviation has no variance under this channel: long outages that hardly any simulated "
+            "lap shows make a large part of its mean, so the RMS of laps comes out too small"
         )
 
 

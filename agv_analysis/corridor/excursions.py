@@ -12,6 +12,7 @@ import numpy as np
 from agv_analysis.corridor.widths import Widths, deviation, share_of
 from agv_analysis.run import Floats
 from agv_analysis.simulation.loop import (
+    Flags,
     Loop,
     Rows,
     RunInputs,
@@ -47,20 +48,26 @@ class Plan(NamedTuple):
 
 
 def excursions(
-    reference: Rows, inputs: RunInputs, widths: Widths, plan: Plan, offsets: Rows, found: Floats, paths: Floats
+    reference: Rows, inputs: RunInputs, widths: Widths, plan: Plan, offsets: Rows, chosen: Flags, found: Floats,
+    paths: Floats,
 ) -> None:  # fmt: skip
     """Drive them; excursion s begins at step plan.first + s plan.every, with the reception of a pose.
 
-    Its AGV is displaced by offsets[s], in its own frame [m, m, rad]; `offsets` without rows: none is.
-    Its slot i has the outcome inputs.lost[i]. `found`, shape (S, COLUMNS), is filled in, and the first rows of `paths`,
-    shape (S, steps, 3): x_e, y_e, theta_e of the AGV before each slot. If `paths` has no rows nothing is kept.
-    `reference` has as many rows as are driven and looked ahead to.
+    With `chosen`, shape (S,), those that are not are left out; without rows: none is. The AGV is displaced by
+    offsets[s], in its own frame [m, m, rad]; `offsets` without rows: it is not. Slot i has the outcome inputs.lost[i].
+    `found`, shape (S, COLUMNS), is filled in, and the first rows of `paths`, shape (S, steps, 3): x_e, y_e, theta_e of
+    the AGV before each slot. If `paths` has no rows nothing is kept. `reference` has as many rows as are driven and
+    looked ahead to.
     """
     base = inputs.start
     for k in range(plan.first):
         base = loss_free(base, reference, k, inputs)
     for s in range(len(found)):
         k = plan.first + s * plan.every
+        if len(chosen) > 0 and not chosen[s]:
+            for step in range(plan.every):
+                base = loss_free(base, reference, k + step, inputs)
+            continue
         run = base
         if len(offsets) > 0:
             run = displaced(base, offsets[s][0], offsets[s][1], offsets[s][2])

@@ -21,7 +21,8 @@ from agv_analysis.simulation.loop import Loop, RunInputs, history
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.reference import repeated
 from agv_analysis.simulation.single import settings_of, start_of
-from agv_analysis.stability.scenario_loop import lap_of
+from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.scenario_loop import lap_of, loop_on_lap
 from agv_ros.pose import Pose
 
 RECOVERY_SECONDS = 10.0
@@ -52,7 +53,7 @@ class Excursions(NamedTuple):
     @property
     def worst(self) -> int:
         """Which of them uses the largest share."""
-        return int(np.argmax(self.share))
+        return int(np.nanargmax(self.share))
 
 
 class LapLoop:
@@ -97,9 +98,11 @@ class LapLoop:
 
     def excursions(
         self, outcomes: Outcomes, every: int = 1, limit: float = math.inf,
-        offsets: Floats | None = None, kept: int = 0, follow: bool = True,
+        offsets: Floats | None = None, kept: int = 0, follow: bool = True, chosen: NDArray[np.bool_] | None = None,
     ) -> tuple[Excursions, Floats]:  # fmt: skip
         """Excursions under the same outcomes, True where lost, from every so many steps of a lap.
+
+        Or only from those of them that are `chosen`, shape (S,); of the others the share is NaN.
 
         They end at `limit`, a share of the corridor, when they are over, or, if they are not to be followed, with the
         last outcome. The first outcome is a reception, after the last one all are. The AGVs are displaced by `offsets`,
@@ -108,6 +111,7 @@ class LapLoop:
         """
         lost = np.concatenate((outcomes, np.zeros(self.recovery if follow else 0, dtype=np.bool_)))
         shift = np.zeros((0, 3)) if offsets is None else offsets
+        which = np.zeros(0, dtype=np.bool_) if chosen is None else chosen
         losses = int(np.flatnonzero(lost).max(initial=0)) if follow else len(lost)
         steps = np.arange(0, self.steps, every)
         found, paths = np.full((len(steps), COLUMNS), math.nan), np.full((len(steps), kept, 3), math.nan)
@@ -118,13 +122,19 @@ class LapLoop:
             plan, rows = Plan(first, every, losses, limit), slice(int(part[0]), int(part[-1]) + 1)
             run_parts(
                 excursions, self._parts, reference, self.inputs(lost), self.widths, plan, numbers(shift[rows]),
-                found[rows], paths[rows],
+                numbers(which[rows]), found[rows], paths[rows],
             )  # fmt: skip
 
         parts = np.array_split(np.arange(len(steps)), min(cores(), max(1, len(steps) // _AT_ONCE)))
         with ThreadPoolExecutor(len(parts)) as pool:
             list(pool.map(drive, parts))
-        return Excursions(steps, found[:, 0], found[:, 1].astype(np.int64), found[:, 2], found[:, 3]), paths
+        after = np.nan_to_num(found[:, 1]).astype(np.int64)
+        return Excursions(steps, found[:, 0], after, found[:, 2], found[:, 3]), paths
+
+    @functools.cached_property
+    def linear(self) -> LinearLoop:
+        """The loop to first order. Raises NoNominalMotionError if it does not settle even without losses."""
+        return loop_on_lap(self.scenario)
 
     @functools.cached_property
     def loss_free_share(self) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 
 from agv_analysis.compiled import numbers
 from agv_analysis.corridor.lap_loop import LapLoop
-from agv_analysis.corridor.rare_leaving import leaving_rate
+from agv_analysis.corridor.rare_leaving import leaving_rate, outages_of
 from agv_analysis.corridor.shares import path_shares
 from agv_analysis.corridor.single_outage import SingleOutage
 from agv_analysis.link.channel_fit import Estimate
@@ -86,9 +86,12 @@ class Leaving:
 
 def leaving(
     loop: LapLoop, single: SingleOutage | None, laps: int | None = None,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Callable[[int], None] = lambda done: None, n_proved: int | None = None,
 ) -> Leaving:  # fmt: skip
-    """How often a scenario's loop leaves its corridor. `single`: what one outage does to it, where that is known."""
+    """How often a scenario's loop leaves its corridor. `single`: what one outage does to it, where that is known.
+
+    It stays inside whatever outages of up to `n_proved` slots come; None: that is not known.
+    """
     scenario = with_windows(loop.scenario, loop.steps * loop.ts)
     parts = parts_of_traces(scenario)
     if not is_random(scenario) and parts == 1:
@@ -99,12 +102,19 @@ def leaving(
     left, seconds = sum(lap.share > 1.0 for lap in driven), sum(lap.steps for lap in driven) * loop.ts
     chain = chain_alone(loop.scenario)
     if left < ENOUGH and chain is not None and single is not None and single.n is not None and single.n >= 0:
+        longer = 1.0 if n_proved is None or n_proved < 0 or left else outages_of(chain, n_proved + 1)
+        if longer * HOUR / loop.ts < _NEVER:
+            method = f"how rarely an outage is longer than the {n_proved} slots with which it stays inside"
+            return _of_rate(loop, Estimate(0.0, 0.0, longer), driven, method)
         rate = leaving_rate(loop, chain, single.n, loop.scenario.relay.seed)
         if 0.0 < rate.per_slot.value * loop.steps < _RARE:
             return _of_rate(loop, rate.per_slot, driven, f"importance splitting with {rate.runs} runs")
     method = f"{laps} simulated laps, {left} of which left it"
     return _of_laps(loop, Estimate.of(left, laps), seconds / left if left else None, driven, method)
 
+
+_NEVER = 1e-30
+"""Expected number of times an hour below which it is not estimated how often the corridor is left."""
 
 _RARE = 0.2
 """Expected number of times a lap up to which they count as independent of each other."""

@@ -260,9 +260,12 @@ def _push(
     size, half = F.shape[1], (directions.shape[0] - 2) // 2
     M, M_next = np.empty((size, size)), np.empty((size, size))
     N, N_next = np.empty((size, size)), np.empty((size, size))
-    sine = math.sin(2.0 * math.pi / sides)
+    per_sine, per_lever = 1.0 / math.sin(2.0 * math.pi / sides), 1.0 / lever
     c_y, c_t = directions[2:, 1].copy(), directions[2:, 2] / lever
     sectors = np.zeros(half + 1, dtype=np.int64)
+    across = np.empty(sides, dtype=np.int64)
+    for i in range(sides):
+        across[i] = (i + half) % sides
     for j in range(bounds.shape[0]):
         for i in range(count):
             bounds[j, i] = window[0, i]
@@ -289,12 +292,19 @@ def _push(
             b_x = (1.0 - share) * bias[before, length, 0] + share * bias[after, length, 0]
             b_y = (1.0 - share) * bias[before, length, 1] + share * bias[after, length, 1]
             b_t = (1.0 - share) * bias[before, length, 2] + share * bias[after, length, 2]
+            r_x, r_y, r_t = remainder[part, length, 0], remainder[part, length, 1], remainder[part, length, 2]
             for i in range(half + 1):
-                one, other = (0, 1) if i == 0 else (i + 1, i + 1 + half)
-                x, y, theta = directions[one, 0], directions[one, 1], directions[one, 2]
-                p_x = M[0, 0] * x + M[1, 0] * y + M[2, 0] * theta
-                p_y = M[0, 1] * x + M[1, 1] * y + M[2, 1] * theta
-                p_t = (M[0, 2] * x + M[1, 2] * y + M[2, 2] * theta) / lever
+                if i == 0:  # along x_e
+                    one, other, y, theta = 0, 1, 0.0, 0.0
+                    p_x, p_y, p_t = M[0, 0], M[0, 1], M[0, 2] * per_lever
+                    pushed, unknown = b_x, r_x
+                else:  # of the polygon
+                    one, other = i + 1, i + 1 + half
+                    y, theta = directions[one, 1], directions[one, 2]
+                    p_x = M[1, 0] * y + M[2, 0] * theta
+                    p_y = M[1, 1] * y + M[2, 1] * theta
+                    p_t = (M[1, 2] * y + M[2, 2] * theta) * per_lever
+                    pushed, unknown = b_y * y + b_t * theta, r_y * abs(y) + r_t * abs(theta)
                 ahead, behind = (bounds[j, 0], bounds[j, 1]) if p_x >= 0.0 else (bounds[j, 1], bounds[j, 0])
                 value, opposite = abs(p_x) * ahead, abs(p_x) * behind
                 side = sectors[i]
@@ -304,18 +314,15 @@ def _push(
                     left, right = c_y[side] * p_t - c_t[side] * p_y, p_y * c_t[further] - p_t * c_y[further]
                     if left >= 0.0 and right >= 0.0:
                         near, far = bounds[j, 2 + side], bounds[j, 2 + further]
-                        value += (right * near + left * far) / sine
-                        near, far = bounds[j, 2 + (side + half) % sides], bounds[j, 2 + (further + half) % sides]
-                        opposite += (right * near + left * far) / sine
+                        value += (right * near + left * far) * per_sine
+                        near, far = bounds[j, 2 + across[side]], bounds[j, 2 + across[further]]
+                        opposite += (right * near + left * far) * per_sine
                         sectors[i] = side
                         break
                     if left < 0.0 and c_y[side] * p_y + c_t[side] * p_t > 0.0:
                         side = side - 1 if side > 0 else sides - 1
                     else:
                         side = further
-                pushed = b_x * x + b_y * y + b_t * theta
-                unknown = remainder[part, length, 0] * abs(x) + remainder[part, length, 1] * abs(y)
-                unknown += remainder[part, length, 2] * abs(theta)
                 window[length, one] = max(window[length, one], value + pushed + unknown)
                 window[length, other] = max(window[length, other], opposite - pushed + unknown)
         for length in range(longest):

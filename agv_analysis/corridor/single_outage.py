@@ -22,8 +22,9 @@ _PLACES, _SHORTER = 128, 32
 FEW_PLACES = 40
 """Places of the lap for a rough answer."""
 
-_FINE = 8
-"""Every so many steps of the lap it is tried whether a shorter one leaves, before every step is."""
+_FINE, _NEAR, _ALIKE = 8, 0.95, 1e-9
+"""Every so many steps of the lap an outage is driven; between them where it comes so near to the worst, or outside,
+unless places differ by less than that."""
 
 _MANY = 2000
 """Places from which the longest outage is tried."""
@@ -43,7 +44,10 @@ class SingleOutage:
     deviation: float
     """Largest distance from the reference after an outage of n slots, or of the longest tried, from anywhere [m]."""
     shares: Floats
-    """Largest share of the corridor that an outage of n slots uses, by the step at which it begins, shape (N,)."""
+    """Largest share of the corridor that an outage of n slots uses, by the step at which it begins, shape (N,).
+
+    Interpolated between steps of a grid where it is far from the largest.
+    """
 
 
 def single_outage(loop: LapLoop) -> SingleOutage:
@@ -55,19 +59,34 @@ def single_outage(loop: LapLoop) -> SingleOutage:
         if all_inside.share.max() <= 1.0:
             return _found(loop, None, all_inside.worst * many, all_inside)
         shortest = LONGEST
-    while shortest > 0 and loop.excursions(outage(shortest - 1), _FINE, limit=1.0)[0].share.max() > 1.0:
-        shortest -= 1
     inside: Excursions | None = None
     outside: Excursions | None = None
     while shortest > 0:
-        tried, _ = loop.excursions(outage(shortest - 1))
-        if tried.share.max() <= 1.0:
+        tried = _from_all_steps(loop, shortest - 1)
+        if np.nanmax(tried.share) <= 1.0:
             inside = tried
             break
         outside, shortest = tried, shortest - 1
     if outside is None:
-        outside, _ = loop.excursions(outage(shortest))
+        outside = _from_all_steps(loop, shortest)
     return _found(loop, shortest - 1, outside.worst, outside if inside is None else inside)
+
+
+def _from_all_steps(loop: LapLoop, n: int) -> Excursions:
+    """Excursions after outages of n slots from every step of the lap that may be the worst one.
+
+    How far an outage leads changes little from one step to the next. So of the steps between two of a grid those are
+    driven where it leads nearly as far as anywhere, or nearly outside, at one of the two; the others' share is NaN.
+    """
+    coarse, _ = loop.excursions(outage(n), _FINE)
+    of_both = np.maximum(coarse.share, np.roll(coarse.share, -1))
+    largest = float(coarse.share.max())
+    near = (of_both >= _NEAR * min(largest, 1.0)) & (largest - float(coarse.share.min()) > _ALIKE * largest)
+    chosen = np.repeat(near, _FINE)[: loop.steps]
+    fine, _ = loop.excursions(outage(n), chosen=chosen)
+    for values, at_grid in zip(fine[1:], coarse[1:], strict=True):
+        values[coarse.steps] = at_grid
+    return fine
 
 
 def roughly(loop: LapLoop, places: int = FEW_PLACES) -> int | None:
@@ -78,8 +97,9 @@ def roughly(loop: LapLoop, places: int = FEW_PLACES) -> int | None:
 
 def _found(loop: LapLoop, n: int | None, step: int, inside: Excursions) -> SingleOutage:
     x, y = loop.lap[step, :2].tolist()
-    shares = np.interp(np.arange(loop.steps), inside.steps, inside.share)
-    return SingleOutage(n, step, x, y, float(np.hypot(inside.along, inside.across).max()), shares)
+    known = ~np.isnan(inside.share)
+    shares = np.interp(np.arange(loop.steps), inside.steps[known], inside.share[known])
+    return SingleOutage(n, step, x, y, float(np.nanmax(np.hypot(inside.along, inside.across))), shares)
 
 
 def _shortest_leaving(loop: LapLoop, every: int, shorter: int = _SHORTER) -> int | None:

@@ -18,7 +18,7 @@ Source: Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 20
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from agv_analysis.simulation.loop import history
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.single import settings_of
 from agv_analysis.stability.linear_loop import LinearLoop
+from agv_analysis.stability.mean_square import spectral_radius
 from agv_analysis.stability.products import multiply
 from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.staleness.estimate import staleness_policy
@@ -53,6 +54,8 @@ class StationaryDeviation:
     mean_square_along: Floats
     """The same along the AGV's heading."""
     mean_square_across: Floats
+    has_heavy_tail: bool = False
+    """Do the squares have no variance? Then outages that hardly any run shows make a large part of their mean."""
 
     @property
     def rms(self) -> float:
@@ -89,7 +92,17 @@ def stationary_deviation(loop: LapLoop, linear: LinearLoop, chain: Chain) -> Sta
     noise = _noise(loop, np.concatenate((G, H), axis=1), q)
     moments = np.zeros((len(chain.delivery), m + q + 1, m + q + 1))
     moments[:, -1, -1] = chain.stationary
-    return _settled(received, lost, noise, chain, moments, nominal, loop)
+    found = _settled(received, lost, noise, chain, moments, nominal, loop)
+    return replace(found, has_heavy_tail=_fourth_moments_grow(linear, chain))
+
+
+def _fourth_moments_grow(linear: LinearLoop, chain: Chain) -> bool:
+    """Do those of the error along a straight track? False where it does not go its own way."""
+    a = linear.along_gain
+    if a is None:
+        return False
+    received, lost = np.array([[1.0 - a, 0.0], [1.0, 0.0]]), np.array([[1.0, -a], [0.0, 1.0]])
+    return spectral_radius(np.kron(received, received), np.kron(lost, lost), chain) >= 1.0
 
 
 def nominal_and_drift(loop: LapLoop) -> tuple[Floats, Floats]:
