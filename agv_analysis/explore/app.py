@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import json
 import secrets
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +140,7 @@ def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
         html.Pre("", id="exported"),
         dcc.Download(id="file"),
         dcc.Store(id="pinned"),
+        dcc.Store(id="tube"),
         dcc.Interval(id="again", interval=_PAUSE, max_intervals=_AGAIN),
     ]
     return html.Main([html.Div(controls, id="controls"), html.Div(shown, id="shown")])
@@ -190,6 +192,7 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
             found = respond(asked(values(tuple(settings))), other)
         except UserError as error:
             return dash.no_update, dash.no_update, dash.no_update, said(error), "old"
+        found.track["layout"]["meta"] = _mark(settings)
         return found.track, found.time, _table(dash.html, found.rows), "", "old"
 
     @app.callback(*(Output(key, "style") for key in SHOWN_FOR_A_LAW), Input("law", "value"), prevent_initial_call=True)
@@ -211,21 +214,19 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
             return _table(dash.html, _DIED), ""
         return _table(dash.html, _MOVED_ON if found is None else found), ""
 
-    @app.callback(
-        Output("plot-track", "figure", allow_duplicate=True), Input("lap", "children"), *states,
-        prevent_initial_call=True,
-    )  # fmt: skip
-    def draw_tube(_: Any, *given: Any) -> Any:  # after the criteria, on the track as `move` drew it
+    @app.callback(Output("tube", "data"), Input("lap", "children"), *states, prevent_initial_call=True)
+    def find_tube(_: Any, *given: Any) -> Any:  # after the criteria
         try:
             scenario = asked(values(given))
             found = None if widths_of(scenario.error_detector) is None else tube(scenario)
         except (UserError, WorkerDiedError):  # `move` and the criteria say why
             found = None
-        if not found:
-            return dash.no_update
-        figure = dash.Patch()
-        figure["data"].extend(found)
-        return figure
+        return {"mark": _mark(given), "traces": found} if found else dash.no_update
+
+    app.clientside_callback(
+        _ADD_TUBE, Output("plot-track", "figure", allow_duplicate=True), Input("tube", "data"),
+        State("plot-track", "figure"), prevent_initial_call=True,
+    )  # fmt: skip
 
     @app.callback(
         Output("pinned", "data"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"), *states,
@@ -254,6 +255,16 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
             return said(error), dash.no_update
         command = "agv-ncs simulate explored.yaml --report explored.html"
         return f"{command}\n\n# explored.yaml\n{text}", {"content": text, "filename": "explored.yaml"}
+
+
+def _mark(settings: Sequence[Any]) -> str:
+    """What tells the figure of one setting from those of others."""
+    return json.dumps(list(settings))
+
+
+_ADD_TUBE = """(tube, figure) => tube && figure && figure.layout.meta === tube.mark
+  ? { ...figure, data: figure.data.concat(tube.traces) } : window.dash_clientside.no_update"""
+"""Adds a tube to the figure of the track, unless that is another setting's by now: the browser alone knows it."""
 
 
 def _table(html: Any, rows: list[tuple[str, str, str]]) -> list[Any]:

@@ -397,6 +397,24 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
     assert complaints(page) == []
 
 
+def test_a_tube_is_drawn_on_the_figure_of_its_own_setting_alone(page: Page) -> None:
+    from selenium.webdriver.common.by import By
+
+    more = page.chrome.find_element(By.ID, "more")
+    more.send_keys("error_detector.track=line\nerror_detector.corridor=0.25\nplant.duration=5.0")
+    page.until(lambda: any("tube for any outages" in name for name in page.names("track")))
+    late = "{ mark: 'another setting', traces: [{ x: [0, 1], y: [0, 1], name: 'late' }] }"
+    drawn = f"dash_clientside.set_props('tube', {{ data: {late} }})"
+    page.chrome.execute_script(drawn)
+    page.chrome.execute_script(drawn.replace("'another setting'", _MARK_SHOWN).replace("'late'", "'in time'"))
+    page.until(lambda: "in time" in page.names("track"))
+    assert "late" not in page.names("track")
+    assert complaints(page) == []
+
+
+_MARK_SHOWN = "document.querySelector('#plot-track .js-plotly-plot').layout.meta"
+
+
 def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     page.click("preset-missed")
     page.until(lambda: "13 steps (65 ms)" in page.text("summary"))
