@@ -112,7 +112,7 @@ def fitted_ages(n: NDArray[np.int64]) -> AgeChain:
     for s in np.flatnonzero(total == 0.0):
         moves[s, D + 1, min(s + 1, D + 1)] = total[s] = 1.0
     used = np.zeros(D + 2, dtype=bool)
-    used[min(int(n[0]), D + 1)] = True
+    used[int(np.argmax(total))] = True  # what follows the usual ones: those of the beginning may never come again
     for _ in used:
         used |= (moves[used] > 0.0).any(axis=(0, 1))
     return AgeChain((moves / total[:, None, None])[np.ix_(used, np.ones(D + 2, dtype=bool), used)])

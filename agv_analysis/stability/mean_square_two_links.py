@@ -33,7 +33,7 @@ from agv_analysis.link.markov_channel import cycle_of
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import growth_of_repeated, growth_over_lap
-from agv_analysis.stability.products import assign, divide, largest_entry
+from agv_analysis.stability.products import assign, divide, largest_entry, multiply_sparse
 
 POLICIES = ("hold", "zero")
 """Downlink policies that are a Markov jump linear system of (z, h, u); others remember more."""
@@ -97,7 +97,7 @@ def _multiply_through(maps: Floats, outcomes: NDArray[np.int64], begin: int, ste
     log_scale, before = 0.0, np.empty_like(product)
     for k in range(steps):
         assign(product, before)
-        _multiply(maps[(begin + k) % maps.shape[0], outcomes[k % len(outcomes)]], before, product)
+        multiply_sparse(maps[(begin + k) % maps.shape[0], outcomes[k % len(outcomes)]], before, product)
         largest = largest_entry(product)
         if largest > 1e100 or 0.0 < largest < 1e-100:
             divide(product, largest)
@@ -122,7 +122,7 @@ def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: i
             for outcome in range(maps.shape[1]):
                 weight = probabilities[s, outcome]
                 if weight > 0.0:
-                    _multiply(maps[row, outcome], moments[s], half)
+                    multiply_sparse(maps[row, outcome], moments[s], half)
                     _add_symmetric(half, maps[row, outcome], weight, after[s])
         largest = 0.0
         for t in range(states):
@@ -140,19 +140,6 @@ def _drive_lap(maps: Floats, transition: Floats, probabilities: Floats, steps: i
                 divide(moments[t], largest)
             log_scale += math.log(largest)
     return log_scale
-
-
-def _multiply(A: Floats, X: Floats, product: Floats) -> None:
-    """`product` = A X, passing over the zeros of A, which are most of it."""
-    size = A.shape[0]
-    for i in range(size):
-        for j in range(size):
-            product[i, j] = 0.0
-        for m in range(size):
-            factor = A[i, m]
-            if factor != 0.0:
-                for j in range(size):
-                    product[i, j] += factor * X[m, j]
 
 
 def _add_symmetric(half: Floats, A: Floats, weight: float, total: Floats) -> None:

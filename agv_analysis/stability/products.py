@@ -154,3 +154,16 @@ def multiply(A: Floats, B: Floats, transposed: bool, product: Floats, add: bool)
             for m in range(column_count(A)):
                 value += A[i, m] * (B[j, m] if transposed else B[m, j])
             product[i, j] = value
+
+
+def multiply_sparse(A: Floats, X: Floats, product: Floats) -> None:
+    """`product` = A X, shapes (n, n), passing over the zeros of A, which are most of it; for compiled callers."""
+    size = A.shape[0]
+    for i in range(size):
+        for j in range(size):
+            product[i, j] = 0.0
+        for m in range(size):
+            factor = A[i, m]
+            if factor != 0.0:
+                for j in range(size):
+                    product[i, j] += factor * X[m, j]

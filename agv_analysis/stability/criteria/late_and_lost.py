@@ -22,6 +22,9 @@ from agv_plant.parameters import RelayParameters
 _PLACES, _FEWEST, _WORK = 2000, 50, 2e7
 """Places of a lap at which a run is judged, at most and at least, and numbers to be moved over them, see `work`."""
 
+_WORK_OF_CHANNEL = 2e8
+"""The same for a channel that is known; of places as many as this allows."""
+
 _NAME, _LABEL = "late_poses.mean_square_growth", "Late and lost poses as they are, mean square"
 
 
@@ -49,15 +52,18 @@ def growths_of_halves(facts: RunFacts) -> tuple[float | None, float | None]:
 
 def _growth(facts: RunFacts, rows: slice) -> float | None:
     ages = fitted_ages((facts.run.acting_age if facts.ages_add_up else facts.run.n_ul)[rows])
-    share = _WORK / max(1.0, delayed_mean_square.work(facts.loop, ages))
-    loop = facts.loop.thinned(min(_PLACES, max(_FEWEST, round(share * facts.loop.steps))))
+    loop = _thinned(facts.loop, ages, _WORK, _PLACES)
     return None if _why_not(loop, ages) else delayed_mean_square.lap_growth(loop, ages) / loop.steps
+
+
+def _thinned(loop: LinearLoop, ages: AgeChain, work: float, places: int) -> LinearLoop:
+    """The loop at `places` of its lap at most, and at as few of them as `work` allows, but not at fewer than 50."""
+    share = work / max(1.0, delayed_mean_square.work(loop, ages))
+    return loop.thinned(min(places, max(_FEWEST, round(share * loop.steps))))
 
 
 def _why_not(loop: LinearLoop, ages: AgeChain) -> str:
     """Why there is no answer for a loop and its chain of ages; empty if there is one."""
-    if loop.predicts and not loop.is_exact:
-        return "computed for a pose that is held, not for one that is predicted by a wrong model"
     if delayed_mean_square.work(loop, ages) > delayed_mean_square.MOST_WORK:
         return f"poses may be {ages.oldest} slots late, which would take too long to compute"
     return ""
@@ -80,6 +86,7 @@ def growth_of_channel(loop: LinearLoop, relay: RelayParameters, ts: float) -> fl
     ages = age_chain_of(relay.uplink, ts)
     if ages is None:
         return "losses with a memory and random delays, or a channel that is no finite Markov chain"
+    loop = _thinned(loop, ages, _WORK_OF_CHANNEL, loop.steps)
     return _why_not(loop, ages) or delayed_mean_square.lap_growth(loop, ages) / loop.steps
 
 
