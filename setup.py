@@ -6,6 +6,9 @@ from setuptools import find_packages, setup
 
 PACKAGE = "agv_ncs"
 
+# `colcon build --symlink-install` runs a link to this file in its build folder, where nothing links to the README.
+README = Path(__file__).resolve().with_name("README.md")
+
 EXTRAS = {
     # Recording, compressed bags of others, and what their messages mean where they do not say it themselves.
     "bags": ["isal>=1.1", "lz4>=4.0", "mcap>=1.6", "rosbags>=0.10.9", "zstandard>=0.18"],
@@ -27,7 +30,7 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     description="An AGV's control loop over a lossy radio link on ROS 2: run it, record it, learn whether it is stable",
-    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description=README.read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     author="The agv_ncs developers",
     maintainer="The agv_ncs developers",

@@ -98,12 +98,13 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         feeds = [output for output in (self._error_out, self._reference_out) if output is not None]
         if self._is_timed:
             self._age_out = self.output(TimeReference, "edge/age", side=True)
-            self.input(kind, "edge/pose", self._keep_pose, *feeds)
             # Not used; but a relay, if there is one, may wait until its slots have a subscriber.
             self.input(TimeReference, "edge/slot", lambda _: None)
+            self.input(kind, "edge/pose", self._keep_pose, *feeds)
         else:
-            self.input(kind, "edge/pose", self._on_pose, *feeds)
+            # First the slots: a relay waits for a subscriber of the poses, and then has that of the slots, too.
             self.input(TimeReference, "edge/slot", self._on_slot, *feeds)
+            self.input(kind, "edge/pose", self._on_pose, *feeds)
 
     def on_settings(self) -> None:
         """Parameters that were changed while the node runs."""
@@ -260,8 +261,8 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         paths = {"paths": str(reference.paths)} if isinstance(reference, PathReference) else {}
         if self._is_timed:
             return paths | {
-                "clock offset": f"{timed.freshest.offset_ns / NS_PER_S:.6f}",
-                "oldest pose": f"{timed.oldest_ns / NS_PER_S:.6f}",
+                "clock offset [s]": f"{timed.freshest.offset_ns / NS_PER_S:.6f}",
+                "oldest pose [s]": f"{timed.oldest_ns / NS_PER_S:.6f}",
                 "stamps in the future": str(timed.freshest.future),
                 "outdated messages": str(timed.freshest.outdated),
                 "beginnings": str(timed.freshest.beginnings),

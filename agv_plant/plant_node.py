@@ -50,7 +50,7 @@ _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_v
 """A topic that each peer publishes, in the order in which a step passes them."""
 
 
-_ONCE = (("agv/pose", "plant"), *_PEERS, ("agv/slot", "relay"), ("agv/cmd_vel", "relay"))
+_ONCE = (("agv/pose", "plant"), *_PEERS, ("agv/slot", "relay"), ("agv/cmd_vel", "relay"), ("/clock", "plant"))
 """What one node alone publishes, or else two loops have become one."""
 
 
@@ -91,13 +91,13 @@ class PlantNode(LoopNode[PlantParameters]):
         self._truth_out = self.output(PoseStamped, "agv/ground_truth", side=True) if settings.is_noisy else None
         self._transforms = TransformBroadcaster(self, FRAME_AGV)
         self._plans: dict[int, tuple[tuple[float, float], ...]] = {}
+        # First the slots: a relay waits for a subscriber of the commands, and then has that of the slots, too.
+        self.input(TimeReference, "agv/slot", self._on_slot)
         if settings.plan_steps:
             self.input(MultiDOFJointTrajectory, "agv/plan", self._on_plan)
         else:
             self.input(TwistStamped, "agv/cmd_vel", self._on_command)
-        self.input(TimeReference, "agv/slot", self._on_slot)
-        if self._lockstep:
-            self._watch_for_answers()
+        self._begin_by = time.monotonic() + settings.start_timeout
         self.poll(self._begin)
 
     def on_stop(self, reason: str) -> None:
@@ -114,14 +114,31 @@ class PlantNode(LoopNode[PlantParameters]):
     def _begin(self) -> bool:
         wanted = max(self.settings.wait_for_subscribers, self._lockstep)
         if not all(output.is_heard(wanted) for output in self.outputs):
-            return False
-        if rivals := [f"another {node} publishes {topic}" for topic, node in _ONCE if self.count_publishers(topic) > 1]:
-            self.fail(f"{', '.join(rivals)}: use another namespace or ROS_DOMAIN_ID")
+            if time.monotonic() > self._begin_by:
+                self.fail(self._not_begun(wanted))
+            return self.finished
+        if rivals := [f"another {node} publishes {topic}" for topic, node in _ONCE if self._publishers_of(topic) > 1]:
+            remap = ", with -r /clock:=clock -r /diagnostics:=diagnostics," if "/clock" in " ".join(rivals) else ""
+            self.fail(f"{', '.join(rivals)}: use another namespace{remap} or ROS_DOMAIN_ID")
         elif self._lockstep:
+            self._watch_for_answers()
             self._publish()
         else:
             self._keep_time()
         return True
+
+    def _publishers_of(self, topic: str) -> int:
+        """How many nodes publish what this node calls `topic`."""
+        return int(self.count_publishers(self.resolve_topic_name(topic)))
+
+    def _not_begun(self, wanted: int) -> str:
+        """Why the loop has not begun: who does not listen, or is not there."""
+        few = next(output.topic for output in self.outputs if not output.is_heard(wanted))
+        missing = self._silent() or ("recorder" if wanted > 1 else "relay")
+        return (
+            f"the loop has not begun within {self.settings.start_timeout:g} s: {few} has fewer than {wanted} "
+            f"listeners, as wait_for_subscribers asks for: is the {missing} running?"
+        )
 
     # -- the loop ----------------------------------------------------------------------------------------------------
 
@@ -252,10 +269,15 @@ class PlantNode(LoopNode[PlantParameters]):
         peers = self._peers()
         return self.k == 0 or (peers != known and {topic for topic, _ in peers} == {topic for topic, _ in _PEERS})
 
-    def _no_answer(self) -> str:
-        silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), None)
+    def _silent(self) -> str:
+        """The first peer that is not there, empty if all are."""
+        silent = next((peer for topic, peer in _PEERS if not self.count_publishers(topic)), "")
         if silent == "relay" and self.count_publishers("agv/slot"):  # the edge has a domain of its own
-            silent = "edge, with error_detector and controller,"
+            return "edge, with error_detector and controller,"
+        return silent
+
+    def _no_answer(self) -> str:
+        silent = self._silent()
         question = (
             f"is the {silent} running?"
             if silent
@@ -279,7 +301,8 @@ class PlantNode(LoopNode[PlantParameters]):
         """Progress; in realtime also deadlines and what became of commands."""
         facts = {"step": str(self.k)}
         if not self._lockstep:
-            facts |= {name: f"{value:.6g}" for name, value in self.deadline_monitor.summary().items()}
+            summary = self.deadline_monitor.summary().items()
+            facts |= {f"{name} [s]" if name.startswith("jitter") else name: f"{value:.6g}" for name, value in summary}
             facts |= {"stops without command": str(self._held.stops), "outdated commands": str(self._held.outdated)}
         return facts
 

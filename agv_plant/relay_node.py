@@ -18,10 +18,11 @@ from agv_plant.parameters import RelayParameters
 from agv_plant.radio.channel import Channel
 from agv_plant.radio.link import Link, Passage
 from agv_ros.codec import decode_command, decode_odometry, decode_pose, encode_slot, encode_twist, stamp_of
+from agv_ros.endpoints import Output
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST
 from agv_ros.messages import InvalidMessageError
-from agv_ros.node import LoopNode, Output
+from agv_ros.node import LoopNode
 
 _LOOK_PERIOD = 1.0
 """How often [s] the relay checks that nothing but itself connects the AGV's domain and the edge's."""
@@ -45,9 +46,9 @@ class RelayNode(LoopNode[RelayParameters]):
         kind, self._command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
         self._agv, self._edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
         self._edge_pose = self.output(pose_kind, "edge/pose", on=self._edge)
-        self._edge_slot = self.output(TimeReference, "edge/slot", on=self._edge)
+        self._edge_slot = self.output(TimeReference, "edge/slot", optional=True, on=self._edge)
         self._agv_cmd_vel = self.output(Twist if self._loses_stamp else kind, f"agv/{self._command}", on=self._agv)
-        self._agv_slot = self.output(TimeReference, "agv/slot", on=self._agv)
+        self._agv_slot = self.output(TimeReference, "agv/slot", optional=True, on=self._agv)
         self.input(pose_kind, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot, on=self._agv)
         self.input(kind, f"edge/{self._command}", self._on_command, self._agv_cmd_vel, self._agv_slot, on=self._edge)
         if self._agv is not self._edge:
@@ -96,7 +97,7 @@ def _counts(name: str, link: Link) -> dict[str, str]:
         f"{name} sent": str(link.sent),
         f"{name} lost": str(link.lost),
         f"{name} loss rate": f"{rate:.6f}",
-        f"{name} longest outage": str(link.longest),
+        f"{name} longest outage [slots]": str(link.longest),
         f"{name} delayed": str(link.delayed),
         f"{name} duplicated": str(link.copies),
         f"{name} expired": str(link.expired),

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -18,17 +19,28 @@ DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 os.environ.setdefault(DISCOVERY_RANGE, "LOCALHOST")
 
 import rclpy
+from builtin_interfaces.msg import Time as TimeMessage
+from rcl_interfaces.msg import Log
+from rclpy.duration import Duration
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
-from agv_ros.errors import UserError
+from agv_ros.errors import UserError, open_text
 from agv_ros.node import LoopNode
 
 EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "single": SingleThreadedExecutor}
 
 SPIN_TIMEOUT = 0.05
 """Longest wait [s] for the next event. Unbounded, the events executor neither runs timers nor sees signals."""
+
+_ROSOUT_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+_ROSOUT_PATIENCE = 0.5
+"""How long [s] a process that fails looks for those who watch /rosout."""
 
 LAST_FLUSH_TIMEOUT = 10.0
 """How long [s] a node that finishes normally waits for subscribers that lag."""
@@ -128,7 +140,8 @@ def discovery_note() -> str:
     """Who can find the nodes of this process, and how to change that."""
     range_ = os.environ[DISCOVERY_RANGE]
     whom = {
-        "LOCALHOST": "this host alone finds the loop", "OFF": "no other process finds the loop",
+        "LOCALHOST": f"this host alone finds the loop; with {DISCOVERY_RANGE}=SUBNET other hosts do",
+        "OFF": "no other process finds the loop",
         "SUBNET": "every host of the network finds the loop and can send it messages",
     }.get(range_, "the middleware's own default holds")  # fmt: skip
     return f"discovery: {DISCOVERY_RANGE}={range_}, {whom}"
@@ -137,17 +150,53 @@ def discovery_note() -> str:
 def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = None) -> None:
     """Body of a node's `main`: make it, run it until it ends or is stopped, and exit with its status.
 
-    What is wrong with a parameter or a file is said in one line, with exit status 1.
+    What is wrong with a parameter or a file is said in one line, on /rosout as well, with exit status 1.
     """
+    words = sys.argv[1:] if args is None else list(args)
     with stop_on_signals() as stop:
-        rclpy.init(args=None if args is None else list(args), signal_handler_options=SignalHandlerOptions.NO)
+        failure = _initialise(words)
         try:
-            failure = _run(make, stop)
+            failure = failure or _run(make, stop)
+            if failure:
+                _say_on_rosout(make.__name__, failure)
         finally:
             rclpy.try_shutdown()
     if failure:
         print(failure, file=sys.stderr)
         raise SystemExit(1)
+
+
+def _initialise(words: list[str]) -> str:
+    """Initialise ROS with the arguments of this process; why that cannot be, in a line, and then without them."""
+    try:
+        for path in params_files_in(words):
+            with open_text(path, UserError):
+                pass
+        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+    except (UserError, rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        reason = str(error).partition("\n")[0].partition(", at /")[0]
+        return reason if isinstance(error, UserError) else f"arguments that ROS does not take: {reason}"
+    return ""
+
+
+def params_files_in(words: Sequence[str]) -> list[str]:
+    """The files that arguments name as --params-file."""
+    return [path for flag, path in pairwise(words) if flag == "--params-file"]
+
+
+def _say_on_rosout(name: str, failure: str) -> None:
+    """Tell those who watch /rosout why this node ends; it may never have been made, and nothing waits for nobody."""
+    herald = Node(f"{name.lower()}_failure", enable_rosout=False, start_parameter_services=False)
+    publisher = herald.create_publisher(Log, "/rosout", _ROSOUT_QOS)
+    deadline = time.monotonic() + _ROSOUT_PATIENCE
+    while not publisher.get_subscription_count() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    stamp = TimeMessage(sec=seconds, nanosec=nanoseconds)
+    publisher.publish(Log(stamp=stamp, level=Log.FATAL, name=name, msg=failure))
+    publisher.wait_for_all_acked(Duration(seconds=1))
+    herald.destroy_node()
 
 
 def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
@@ -156,6 +205,7 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     except UserError as error:
         return str(error)
     node.get_logger().info(discovery_note())
+    node.announce()
     executor = EventsExecutor()
     add(executor, node)
     spin(executor, lambda: node.finished or stop.requested)

@@ -16,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.duration import Duration
 from rclpy.exceptions import (
     InvalidParameterTypeException,
     InvalidParameterValueException,
@@ -24,26 +23,23 @@ from rclpy.exceptions import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from agv_ros.codec import encode_diagnostics
+from agv_ros.endpoints import LOOP_QOS, Output
 from agv_ros.errors import UserError
 from agv_ros.messages import CHANGED, PUBLISHED
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
-from agv_ros.stamps import LATEST_NS, Grid, to_nanoseconds
+from agv_ros.stamps import LATEST_NS, Grid
 
 P = TypeVar("P", bound=LoopParameters)
 
-# Deep enough that a reader which falls behind for seconds, the recorder above all, still gets every message, even in
-# lockstep, where they are thousands a second. DDS sets memory aside only for messages that wait.
-# Only copies of it are used: rclpy writes a topic's overrides into the profile that it is given.
-LOOP_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
-
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
+
+_PATIENCE = 3.0
+"""After this time [s] a node that waits for its subscribers says so."""
 
 _LOOK_PERIOD = 1.0
 """How often [s] a node looks for others that publish its topics."""
@@ -56,41 +52,6 @@ STOPPED_BY = "stopped by "
 
 ENDED = "ended"
 """Key in a node's last diagnostics: its counts of messages there are final."""
-
-
-class Output:
-    """A publisher of serialised messages that counts them."""
-
-    def __init__(self, publisher: Publisher, side: bool, where: Node) -> None:
-        self._publisher = publisher
-        self._side = side
-        self._where = where
-        self.count = 0
-        self.topic: str = publisher.topic_name
-
-    def publish(self, data: bytes) -> None:
-        """Send one serialised message."""
-        self.count += 1
-        self._publisher.publish(data)
-
-    def is_heard(self, subscribers: int) -> bool:
-        """Has the topic this many subscribers? One fewer is enough beside the loop: only a recorder listens there."""
-        return bool(self._publisher.get_subscription_count() >= subscribers - self._side)
-
-    def rivals(self) -> list[str]:
-        """Names of other nodes that publish what one node of a loop alone should; none beside the loop."""
-        if self._side or self._where.count_publishers(self.topic) <= 1:
-            return []
-        infos = self._where.get_publishers_info_by_topic(self.topic)
-        others = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos]
-        own = self._where.get_fully_qualified_name()
-        if own in others:  # one of them is this node
-            others.remove(own)
-        return sorted(others)
-
-    def flush(self, seconds: float) -> bool:
-        """Wait until every subscriber has what was sent, `seconds` at most; do they have it?"""
-        return bool(self._publisher.wait_for_all_acked(Duration(nanoseconds=to_nanoseconds(seconds))))
 
 
 class LoopNode(Node, Generic[P]):
@@ -121,6 +82,9 @@ class LoopNode(Node, Generic[P]):
         self.sides: list[Node] = []
         """This node's participants in other DDS domains; to be spun with it."""
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
+        self._unheard: dict[str, tuple[Output, ...]] = {}
+        """Inputs that are not subscribed to yet, with the outputs that too few listen to."""
+        self._tell_of_waiting_at = math.inf
         self._rivals: dict[str, str] = {}
         """Other publishers of this node's topics, as they were seen, by topic."""
         self.add_on_set_parameters_callback(self._on_set_parameters)
@@ -154,15 +118,17 @@ class LoopNode(Node, Generic[P]):
 
     # -- topics ------------------------------------------------------------------------------------------------------
 
-    def output(self, kind: type, topic: str, *, side: bool = False, on: Node | None = None) -> Output:
+    def output(
+        self, kind: type, topic: str, *, side: bool = False, optional: bool = False, on: Node | None = None
+    ) -> Output:
         """Publisher of serialised messages of type `kind`; `side`: no node of the loop listens to it.
 
-        `on` is this node `in_domain`.
+        To an `optional` topic one of ours listens, but maybe not another's in its place. `on` is this node `in_domain`.
         """
         publisher = (on or self).create_publisher(
             kind, topic, copy(LOOP_QOS), qos_overriding_options=QoSOverridingOptions.with_default_policies()
         )
-        self.outputs.append(Output(publisher, side, on or self))
+        self.outputs.append(Output(publisher, side, optional, on or self))
         return self.outputs[-1]
 
     def input(
@@ -183,16 +149,38 @@ class LoopNode(Node, Generic[P]):
             except Exception as error:  # InvalidMessageError, OffGridError, or what no one has thought of
                 self.reject(topic, error)
 
+        where, wanted = on or self, self.settings.wait_for_subscribers
+        self._unheard[topic] = feeds
+
         def subscribe_when_heard() -> bool:
-            if not all(output.is_heard(self.settings.wait_for_subscribers) for output in feeds):
+            if not all(output.is_heard(wanted) for output in feeds):
                 return False
-            (on or self).create_subscription(
+            del self._unheard[topic]
+            where.create_subscription(
                 kind, topic, receive, copy(LOOP_QOS), raw=True,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )  # fmt: skip
             return True
 
         self.poll(subscribe_when_heard)
+
+    def announce(self) -> None:
+        """Log, once, when all inputs are subscribed to; and what is waited for, if that takes long."""
+        self._tell_of_waiting_at = time.monotonic() + _PATIENCE
+        self.poll(self._is_announced)
+
+    def _is_announced(self) -> bool:
+        if not self._unheard:
+            self.get_logger().info("ready")
+        elif time.monotonic() > self._tell_of_waiting_at:
+            self._tell_of_waiting_at = math.inf
+            wanted = self.settings.wait_for_subscribers
+            for output in self.outputs:
+                if any(output in feeds for feeds in self._unheard.values()) and not output.is_heard(wanted):
+                    self.get_logger().info(
+                        f"waiting for those who listen to {output.topic}: wait_for_subscribers is {wanted}"
+                    )
+        return not self._unheard
 
     def poll(self, attempt: Callable[[], bool]) -> None:
         """Call `attempt` now and, until it returns True, again and again."""

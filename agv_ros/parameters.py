@@ -266,9 +266,9 @@ class LoopParameters:
         low=1e-3, high=2e9,
     )  # fmt: skip
     wait_for_subscribers: int = parameter(
-        0,
-        "a node listens to its inputs only once each of its outputs has this many subscribers; "
-        "1 makes the start of a loop lossless, 2 that of a recorded one",
+        1,
+        "a node listens to its inputs only once each of its outputs has this many subscribers; 1: recorders do not "
+        "count, and nodes start without loss in any order, 2: with one recorder, that too, 0: it does not wait",
         low=0,
         high=100,
     )

@@ -25,7 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import TimeReference
 
-from agv_ros.node import LOOP_QOS
+from agv_ros.endpoints import LOOP_QOS
 
 ROLES = ("plant", "relay", "error_detector", "controller")
 

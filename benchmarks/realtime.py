@@ -76,4 +76,4 @@ def _loop() -> dict[str, float]:
                     if status.name == "plant":
                         facts.update({value.key: value.value for value in status.values})
     names = ("jitter p50", "jitter p99", "jitter max", "missed deadlines")
-    return {name: float(facts[name]) for name in names}
+    return {name: float(facts[f"{name} [s]" if name.startswith("jitter") else name]) for name in names}

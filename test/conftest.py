@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import os
 import re
@@ -44,6 +45,30 @@ def _claim_domain() -> tuple[int, socket.socket]:
         else:
             return domain, claim
     raise RuntimeError("every DDS domain is taken by another test process")
+
+
+_LEFT_OUT: dict[str, str] = {}
+"""Test files that need a package that is not installed, with its name."""
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Leave out, where ROS' own packages are all there is, a file whose first lines import what only pip has."""
+    if not collection_path.name.startswith("test_") or collection_path.suffix != ".py":
+        return None
+    names = re.findall(r"^(?:from|import) (\w+)", collection_path.read_text(encoding="utf-8"), re.MULTILINE)
+    missing = [name for name in names if name in _ONLY_PIP and importlib.util.find_spec(name) is None]
+    if missing:
+        _LEFT_OUT[str(collection_path.relative_to(REPOSITORY))] = missing[0]
+    return True if missing else None
+
+
+_ONLY_PIP = ("mcap", "mcap_ros2", "rosbags", "lz4", "zstandard", "werkzeug")
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say what was left out."""
+    for name, package in _LEFT_OUT.items():
+        terminalreporter.write_line(f"LEFT OUT {name}: needs {package}: pip install '.[test]'")
 
 
 # Set before any test imports rclpy: a context takes its domain from here, and so do the processes that tests start.

@@ -30,9 +30,10 @@ from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
 from agv_plant.relay_node import RelayNode
 from agv_plant.vehicle.unicycle import arc_step
+from agv_ros.endpoints import LOOP_QOS
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
-from agv_ros.node import LOOP_QOS, LoopNode
+from agv_ros.node import LoopNode
 from agv_ros.speeds_codec import SpeedsAhead, encode_speeds
 
 if TYPE_CHECKING:
@@ -60,7 +61,8 @@ class Bench:
         self.nodes: list[Node] = [self.probe]
 
     def add(self, kind: Callable[..., LoopNode[Any]], **parameters: Any) -> Any:
-        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
+        alone = {"wait_for_subscribers": 0} | parameters
+        overrides = [Parameter(name.replace("__", "."), value=value) for name, value in alone.items()]
         node = kind(parameter_overrides=overrides, context=self.context, use_global_arguments=False)
         self.executor.add_node(node)
         self.nodes.append(node)
@@ -416,7 +418,7 @@ def test_without_slots_the_edge_steps_by_its_clock_and_records_the_age_of_its_po
         k = (stamp_ns_of(error.header.stamp) - 1_000_000_000) // 20_000_000
         held = -1.0 if age.time_ref == first.header.stamp else -2.0
         assert error.pose.pose.position.x == pytest.approx(0.02 * k - held)
-    assert float(detector.facts()["oldest pose"]) >= 0.2
+    assert float(detector.facts()["oldest pose [s]"]) >= 0.2
 
 
 def test_a_stamp_from_the_future_is_counted_and_not_believed(bench: Bench) -> None:
@@ -563,7 +565,7 @@ def test_the_edge_drives_a_robot_that_is_not_ours_and_it_halts_without_the_edge(
     assert robot.x > 0.0
     assert controller.rejected == detector.rejected == {}
     # The edge's clock minus the robot's, plus the least delay: some 3 s behind.
-    assert float(detector.facts()["clock offset"]) >= -3.0
+    assert float(detector.facts()["clock offset [s]"]) >= -3.0
     bench.executor.remove_node(controller)
     halts = robot.halts
     bench.until(lambda: robot.halts > halts + 5)
@@ -600,7 +602,7 @@ def test_in_real_time_the_agv_stops_without_commands_and_goes_on_when_they_retur
     drive()
     bench.until(lambda: plant.state.x > stopped_at)
     assert int(float(plant.facts()["missed deadlines"])) >= 0
-    assert float(plant.facts()["jitter max"]) >= float(plant.facts()["jitter p50"]) >= 0.0
+    assert float(plant.facts()["jitter max [s]"]) >= float(plant.facts()["jitter p50 [s]"]) >= 0.0
 
 
 def test_in_real_time_the_agv_plays_its_plan_and_then_stands_still(bench: Bench) -> None:
@@ -676,11 +678,14 @@ def test_lockstep_names_the_missing_peer(start: Start, two_domains: tuple[int, i
             start(next(module for module in NODES if name in module), env=env)
             onlooker.until(functools.partial(onlooker.probe.count_publishers, topics[name]))
         onlooker.close()
-        waiting[silent] = start("agv_plant.plant_node", "--ros-args", "-p", "answer_timeout:=4.0", env=env)
+        waiting[silent] = start("agv_plant.plant_node", "--ros-args", "-p", "start_timeout:=4.0", env=env)
     for silent, plant in waiting.items():
         status, said = plant.end()
         assert status == 1
-        assert said.splitlines()[-1] == f"no answer to step 0 on agv/cmd_vel within 4 s: is the {silent} running?"
+        assert said.splitlines()[-1] == (
+            "the loop has not begun within 4 s: /agv/pose has fewer than 1 listeners, as wait_for_subscribers asks "
+            f"for: is the {silent} running?"
+        )
         assert "Traceback" not in said
 
 
@@ -739,7 +744,64 @@ def test_a_node_that_is_started_again_in_an_outage_goes_on_with_the_pose_before_
     assert (status, "Traceback" in said) == (0, False)
 
 
-def test_a_node_with_a_wrong_parameter_says_so_in_one_line(start: Start) -> None:
-    status, said = start("agv_cloud.controller_node", "--ros-args", "-p", "kx:=25").end()
-    assert status == 1
-    assert said.splitlines() == ["controller.kx is a double, got the integer 25: write 25.0"]
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("-p", "kx:=25"), "controller.kx is a double, got the integer 25: write 25.0"),
+        (("--params-file", "/no/such.yaml"), "/no/such.yaml: cannot be read: No such file or directory"),
+    ],
+)
+def test_a_node_that_cannot_start_says_so_in_one_line_and_on_rosout(
+    start: Start, lone_bench: Bench, arguments: tuple[str, ...], said: str
+) -> None:
+    from rcl_interfaces.msg import Log
+
+    logged: list[Any] = []
+    lone_bench.probe.create_subscription(Log, "/rosout", logged.append, 10)
+    node = start("agv_cloud.controller_node", "--ros-args", *arguments)
+    lone_bench.until(lambda: any(entry.msg == said for entry in logged))
+    status, output = node.end()
+    assert (status, output.splitlines()) == (1, [said])
+
+
+def test_help_names_the_topics_and_parameters_that_nodes_have(bench: Bench) -> None:
+    from agv_analysis.runtime.executables import NODE_MODULES
+    from agv_analysis.runtime.node_help import ABOUT, NODE_SCHEMAS, help_text
+    from agv_ros.parameters import parameters_of
+
+    assert ABOUT.keys() == NODE_SCHEMAS.keys() == NODE_MODULES.keys()
+    for kind in NODES.values():
+        node = bench.add(kind)
+        about, of_node = ABOUT[node.get_name()], (node.get_name(), node.get_namespace())
+        for topics, find in (
+            (about.hears, node.get_subscriber_names_and_types_by_node),
+            (about.publishes, node.get_publisher_names_and_types_by_node),
+        ):
+            found = {f"{name} {kinds[0]}" for name, kinds in find(*of_node)}
+            assert {f"/{topic.lstrip('/')}" for topic in topics} <= found
+        text = help_text(node.get_name())
+        assert [name for name in parameters_of(NODE_SCHEMAS[node.get_name()]) if f"  {name} " not in text] == []
+
+
+def test_help_starts_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    from agv_analysis.runtime.executables import run_node_of
+
+    run_node_of("plant", ["--help"])
+    said = capsys.readouterr().out
+    assert said.startswith("plant: The AGV")
+    assert "cmd_vel_timeout [s] = 0.5" in said
+
+
+def test_a_node_that_waits_says_for_whom(lone_bench: Bench) -> None:
+    """A recorder alone is no listener for whom a loop begins; any other node is."""
+    controller = lone_bench.add(ControllerNode, wait_for_subscribers=1)
+    (output,) = (one for one in controller.outputs if one.topic == "/edge/cmd_vel")
+    recorder = Node("recorder", context=lone_bench.context, use_global_arguments=False)
+    lone_bench.nodes.append(recorder)
+    recorder.create_subscription(TwistStamped, "edge/cmd_vel", lambda _: None, LOOP_QOS)
+    lone_bench.until(lambda: controller.count_subscribers("edge/cmd_vel") == 1)
+    assert not output.is_heard(1)
+    assert controller.count_subscribers("edge/error") == 0
+    lone_bench.probe.create_subscription(TwistStamped, "edge/cmd_vel", lambda _: None, LOOP_QOS)
+    lone_bench.until(lambda: controller.count_subscribers("edge/error") == 1)
+    assert output.is_heard(1)

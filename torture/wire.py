@@ -19,8 +19,8 @@ from rclpy.serialization import serialize_message
 
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.runtime.recorder_node import TOPICS
+from agv_ros.endpoints import LOOP_QOS
 from agv_ros.errors import UserError
-from agv_ros.node import LOOP_QOS
 
 _ATTACKED = (
     "agv/pose",

@@ -99,7 +99,7 @@ def deadlines_of(diagnostics: NDArray[np.void], namespace: str, steps: int) -> D
     return Deadlines(
         steps=steps,
         missed=min(total(plant["missed deadlines"]), steps),  # plants counted on after the last step, once
-        longest_overdue=max(plant.get("jitter max", [0.0])),
+        longest_overdue=max(plant.get("jitter max [s]", plant.get("jitter max", [0.0]))),  # bags of 0.1.0 have no unit
         stops=total(plant.get("stops without command", [0.0])),
         ignored=total(plant.get("outdated commands", [0.0])),
         missed_edge_steps=total(edge["missed steps"]) if "missed steps" in edge else None,

@@ -21,10 +21,14 @@ _FOLDER_OF_ROS = "agv_ncs"
 
 
 def run_node_of(name: str, arguments: Sequence[str] | None = None) -> None:
-    """Run a node until it ends; without arguments those of this process.
+    """Run a node until it ends; without arguments those of this process. Help is printed, and nothing is run.
 
     Raises ImportError where there is no ROS.
     """
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if {"--help", "-h"} & set(words):
+        sys.stdout.write(importlib.import_module("agv_analysis.runtime.node_help").help_text(name) + "\n")
+        return
     importlib.import_module(NODE_MODULES[name]).main(arguments)
 
 

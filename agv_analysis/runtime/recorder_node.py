@@ -32,7 +32,7 @@ from agv_ros.executor import run_node
 from agv_ros.messages import PUBLISHED
 from agv_ros.node import ENDED, LoopNode
 from agv_ros.ros_yaml import dump
-from agv_ros.stamps import NS_PER_S
+from agv_ros.stamps import NS_PER_S, to_nanoseconds
 
 TOPICS: dict[str, type] = {
     "/clock": Clock,
@@ -62,6 +62,8 @@ _DIAGNOSTICS = list(TOPICS).index("/diagnostics")
 
 _PARAMETER_EVENTS = list(TOPICS).index("/parameter_events")
 
+_POSE = list(TOPICS).index("agv/pose")
+
 PUBLISHERS = {"plant": "agv/pose", "relay": "edge/slot", "error_detector": "edge/error", "controller": "edge/cmd_vel"}
 """The topic by which each node of the loop is known, whatever it is called."""
 
@@ -88,6 +90,8 @@ class RecorderNode(LoopNode[RecorderParameters]):
         sides = [*(one | {"/diagnostics": everywhere, "/parameter_events": everywhere}).values()]
         self._parameters_of = {node: ParameterClient(one[topic][0], topic) for node, topic in self.asked().items()}
         self._newest_ns = 0
+        self._first_ns: int | None = None
+        """Stamp of the first pose that was recorded."""
         self._names = [self.resolve_topic_name(topic) for topic in TOPICS]
         describe = [
             self._describer(topic, kind, where)
@@ -132,7 +136,13 @@ class RecorderNode(LoopNode[RecorderParameters]):
                 # It has the time of a clock that is not the loop's, which would put it behind all that follows.
                 write(number, data, now_ns(self._newest_ns), self._newest_ns)
 
-        return {_DIAGNOSTICS: record_diagnostics, _PARAMETER_EVENTS: record_change}.get(number, record)
+        def record_pose(data: bytes) -> None:
+            record(data)
+            if self._first_ns is None:
+                self._first_ns = stamp_of(data)
+
+        special = {_DIAGNOSTICS: record_diagnostics, _PARAMETER_EVENTS: record_change, _POSE: record_pose}
+        return special.get(number, record)
 
     def _write(self, number: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         if self._broken:
@@ -233,7 +243,8 @@ class RecorderNode(LoopNode[RecorderParameters]):
         stamp_ns = diagnostics.header.stamp.sec * NS_PER_S + diagnostics.header.stamp.nanosec
         own = self.get_fully_qualified_name().lstrip("/")
         for status in diagnostics.status:
-            if status.name == own:  # what the recorder rejects, it says; it is no node that has to end before it does
+            # What the recorder rejects, it says; it is no node that has to end before it does. Nor are others' nodes.
+            if status.name == own or status.name.rpartition("/")[0] != own.rpartition("/")[0]:
                 continue
             facts = {value.key: value.value for value in status.values}
             counts = {
@@ -268,6 +279,28 @@ class RecorderNode(LoopNode[RecorderParameters]):
         is_said = bool(self._broken) or not any(client.is_waiting for client in self._parameters_of.values())
         return len(self._published) >= nodes and self.is_settled() and is_said
 
+    def _topics_without_messages(self) -> list[str]:
+        """Topics of the loop of which nothing has come though others have, and their publishers have been seen."""
+        counts = dict(zip(TOPICS, self._writer.counts, strict=True))
+        known = {topic: self._parameters_of[node].name for node, topic in self.asked().items()}
+        if not any(counts[topic] for topic in known):
+            return []
+        return [self.resolve_topic_name(topic) for topic, name in known.items() if name and not counts[topic]]
+
+    def _silent_nodes(self) -> list[str]:
+        """Nodes of the loop that have been seen, and have said nothing on /diagnostics."""
+        seen = [client.name.lstrip("/") for client in self._parameters_of.values() if client.name]
+        return [name for name in seen if self._published and name not in self._published]
+
+    def _began_late(self) -> str:
+        """What to do, if the first pose that is here is not the loop's first one."""
+        return _LATE if self._first_ns is None or self._first_ns > self._start_ns() else ""
+
+    def _start_ns(self) -> int:
+        """Stamp of the loop's step 0, as the plant said it."""
+        values = self._parameters_of["plant"].values if "plant" in self._parameters_of else None
+        return to_nanoseconds((values or {}).get("start_time", self.settings.start_time))
+
     def close(self) -> None:
         """Finish the bag and say what is in it."""
         if self._broken:
@@ -283,9 +316,15 @@ class RecorderNode(LoopNode[RecorderParameters]):
             self.failure = self._broken
             return
         self.summary = f"{sum(self._writer.counts)} messages"
+        unheard = self._topics_without_messages()
         if missing:
             lost = ", ".join(f"{count} of {topic}" for topic, count in missing.items())
-            self.failure = f"{self.settings.bag}: the recording is not complete, missing: {lost}"
+            self.failure = f"{self.settings.bag}: the recording is not complete, missing: {lost}{self._began_late()}"
+        elif unheard:
+            self.failure = (
+                f"{self.settings.bag}: the recording is not complete, there is not one message of "
+                f"{', '.join(unheard)}{_LATE}"
+            )
         elif self._running:
             self.summary += f"; these nodes did not say that they ended: {', '.join(sorted(self._running))}"
         elif self._published:
@@ -294,7 +333,12 @@ class RecorderNode(LoopNode[RecorderParameters]):
             self.summary += "; no node of the loop said how many it published"
         if self._again:
             self.summary += f"; started again: {', '.join(sorted(self._again))}"
+        if self._silent_nodes():
+            self.summary += f"; these nodes said nothing of what they published: {', '.join(self._silent_nodes())}"
         self.get_logger().info(f"{self.settings.bag}: {self.summary}")
+
+
+_LATE = ": it began after the loop did; start the recorder first, or set wait_for_subscribers to 2 on the loop's nodes"
 
 
 def _about(params_file: str) -> dict[str, str]:

@@ -17,8 +17,9 @@ from agv_analysis.bags.writer import REPLAY_OF
 from agv_analysis.runtime.edge_inputs import EdgeInputs, SlotInput
 from agv_analysis.runtime.recorder_node import PUBLISHERS, TOPICS, RecorderNode
 from agv_ros.codec import decode_command, decode_error, encode_clock
+from agv_ros.endpoints import LOOP_QOS
 from agv_ros.messages import Command, TrackingError
-from agv_ros.node import LOOP_QOS, LoopNode
+from agv_ros.node import LoopNode
 from agv_ros.parameters import LoopParameters
 
 _PATIENCE = 10.0

@@ -113,8 +113,8 @@ def test_whoever_listens_gets_both_frames(of_another_type: None, prefix: str) ->
 
     from agv_analysis.runtime.one_process import OneProcess
     from agv_analysis.runtime.runner import NODES
+    from agv_ros.endpoints import LOOP_QOS
     from agv_ros.executor import EXECUTORS, spin_for
-    from agv_ros.node import LOOP_QOS
 
     settings = (f"plant.frame_prefix={prefix}", "plant.duration=.inf")
     scenario = load_scenario(str(REPOSITORY / "config/outages.yaml"), settings)
@@ -166,7 +166,7 @@ def test_another_robot_s_transform_goes_beside_ours_and_disturbs_no_analysis(tf_
     from nav_msgs.msg import Odometry
 
     from agv_cloud.error_detector_node import ErrorDetectorNode
-    from agv_ros.node import LOOP_QOS
+    from agv_ros.endpoints import LOOP_QOS
     from test.test_nodes import EDGE_OF_A_ROBOT, ROBOT_S_TOPICS, Bench, Robot
 
     bench, heard = Bench("events"), []

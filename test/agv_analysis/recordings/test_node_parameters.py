@@ -227,7 +227,7 @@ def test_a_node_that_was_started_again_says_its_parameters_again(tmp_path: Path)
         """A controller that reports at step k, and ends after it has been asked."""
         controller = ControllerNode(parameter_overrides=[Parameter("kx", value=kx)], **options)
         executor.add_node(controller)
-        until(lambda: all(output.is_heard(1) for output in controller.outputs))
+        until(lambda: all(output._publisher.get_subscription_count() for output in controller.outputs))
         controller.report_every_second(grid.stamp(k))
         controller.report(grid.stamp(k))
         until(has_answered)

@@ -28,8 +28,8 @@ def until_steps() -> Iterator[UntilSteps]:
     rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     from rosgraph_msgs.msg import Clock
 
+    from agv_ros.endpoints import LOOP_QOS
     from agv_ros.executor import EXECUTORS, spin_for
-    from agv_ros.node import LOOP_QOS
 
     context = rclpy.Context()
     rclpy.init(context=context)

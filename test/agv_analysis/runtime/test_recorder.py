@@ -21,7 +21,9 @@ from rosbags.typesys import Stores, get_typestore
 
 rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
 from rclpy.parameter import Parameter
 
 from agv_analysis.bags.bag import read_bag
@@ -32,9 +34,9 @@ from agv_analysis.recordings.recording import read_run
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_plant.plant_node import PlantNode
+from agv_ros.endpoints import LOOP_QOS
 from agv_ros.errors import UserError
 from agv_ros.executor import EXECUTORS, spin_for
-from agv_ros.node import LOOP_QOS
 
 if TYPE_CHECKING:
     from test.agv_analysis.runtime.conftest import UntilSteps
@@ -175,6 +177,37 @@ def test_the_recorder_says_what_it_has_missed(tmp_path: Path) -> None:
     context.try_shutdown()
     assert recorder.failure.startswith(f"{where}: the recording is not complete, missing: ")
     assert "of /agv/pose" in recorder.failure
+    assert "it began after the loop did; start the recorder first" in recorder.failure
+
+
+def test_a_recorder_minds_the_nodes_of_its_own_loop_alone(tmp_path: Path) -> None:
+    """Others report on the same /diagnostics; without a single pose of the own plant nothing is complete."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    options: dict[str, Any] = {"context": context, "use_global_arguments": False, "namespace": "agv_01"}
+    executor = EXECUTORS["single"](context=context)
+    recorder = RecorderNode(parameter_overrides=[Parameter("bag", value=str(tmp_path / "bag"))], **options)
+    executor.add_node(recorder)
+    others = [rclpy.create_node("plant", **(options | {"namespace": name})) for name in ("agv_01", "agv_02")]
+    reports = others[1].create_publisher(DiagnosticArray, "/diagnostics", LOOP_QOS)
+    others[0].create_publisher(PoseStamped, "agv/pose", LOOP_QOS)
+    errors = others[0].create_publisher(Odometry, "edge/error", LOOP_QOS)
+    assert spin_for(executor, lambda: reports.get_subscription_count() and errors.get_subscription_count(), 60.0)
+    for name in ("agv_02/plant", "agv_01/plant"):
+        fact = KeyValue(key="published /agv_01/edge/error", value="1")
+        reports.publish(DiagnosticArray(status=[DiagnosticStatus(name=name, values=[fact])]))
+    errors.publish(Odometry())
+    assert spin_for(executor, lambda: "agv_01/plant" in recorder._published and not recorder.missing(), 60.0)
+    assert spin_for(executor, lambda: bool(recorder._parameters_of["plant"].name), 60.0)
+    assert recorder._published.keys() == {"agv_01/plant"}
+    recorder.close()
+    for node in (*others, recorder):
+        node.destroy_node()
+    context.try_shutdown()
+    assert recorder.failure.startswith(
+        f"{tmp_path / 'bag'}: the recording is not complete, there is not one message of"
+    )
+    assert "/agv_01/agv/pose" in recorder.failure
 
 
 def test_an_unwritable_directory_is_named(agv_ncs: AgvNcs) -> None:
