@@ -6,7 +6,8 @@ the time that a pose was under way; the least of the last while is taken for the
 least delay and never ahead. It is forgotten after 10 to 20 s, since one clock may run slower than the other.
 
 A stamp that is more than a second away from that time is rejected; but if this persists, the AGV or its clock has been
-restarted, and the edge begins again with the last of these stamps.
+restarted, and the edge begins again with the last of these stamps. Where both clocks are one, a simulator's on /clock,
+they go back together, when it is reset or a recording begins again: then the next pose of the new time is a beginning.
 
 No clock, no thread, no ROS in here: poses and instants go in.
 """
@@ -40,6 +41,7 @@ class FreshestPose:
         """Stamp of the first pose of the run."""
         self._least_ns = self._least_before_ns = self._window_since_ns = 0
         self._rejected = 0
+        self._now_ns = 0
         self.future = 0
         self.outdated = 0
         self.beginnings = 0
@@ -56,7 +58,10 @@ class FreshestPose:
     def offer(self, pose: StampedPose, now_ns: int) -> bool:
         """Take a pose that has just come; is it now the freshest one?"""
         ahead_ns = pose.stamp_ns - self.time(now_ns)
-        if self.pose is None:
+        # A clock that was set has gone back, too, but the stamps have not.
+        went_back, self._now_ns = now_ns < self._now_ns - self._ts_ns, now_ns
+        is_other_time = self.pose is not None and (pose.stamp_ns < self.pose.stamp_ns or abs(ahead_ns) > ACCEPTED_NS)
+        if self.pose is None or (went_back and is_other_time):
             self._begin(pose, now_ns)
             return True
         self.future += ahead_ns > self._ts_ns

@@ -216,6 +216,10 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
 
     def _begin(self) -> None:
         """A run begins: its ticks come just after the AGV's instants, since a command must not be from the future."""
+        number = self._timed.freshest.beginnings
+        if number > 1:
+            at = self._timed.freshest.first_ns / NS_PER_S
+            self.get_logger().warning(f"the AGV, or its clock, began anew: run {number} begins at its time {at:.3f} s")
         self.grid = self._timed.grid
         self._detection.restart()
         if self._timer is None:
@@ -272,6 +276,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             "slots without any pose": str(self._slots.blind),
             "slots whose pose never came": str(self._slots.unanswered),
             "outdated messages": str(self._slots.outdated),
+            "beginnings": str(self._slots.beginnings),
         }
 
 

@@ -33,6 +33,11 @@ class SlotStepping:
         return self._sync.unanswered
 
     @property
+    def beginnings(self) -> int:
+        """Runs that began with a slot: 1 is the first."""
+        return self._sync.beginnings
+
+    @property
     def outdated(self) -> int:
         """Poses and slots that came too late to matter, or a second time."""
         return self._sync.outdated

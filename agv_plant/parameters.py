@@ -52,8 +52,7 @@ class _OwnPlantParameters(LoopParameters):
         5.0, "lockstep: how long to wait for the answer to a step before giving up", unit="s", above=0.0, high=3600.0
     )
     start_timeout: float = parameter(
-        300.0, "how long to wait for the other nodes before giving up, .inf: for ever", unit="s", above=0.0,
-        high=math.inf,
+        300.0, "how long to wait for the other nodes before giving up", unit="s", above=0.0, high=1e6,
     )  # fmt: skip
     cmd_vel_timeout: float = parameter(
         0.5, "realtime: the AGV stops when its newest command is older than this", unit="s", above=0.0, high=3600.0

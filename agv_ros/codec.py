@@ -13,7 +13,7 @@ fixed by the lengths of its strings, so a layout is one `struct.Struct`, made on
 kept. Padding is always written as zeros: equal values give equal bytes.
 
 Decoders accept any frame_id, either byte order and trailing bytes, and raise InvalidMessageError, never struct.error,
-on anything else: too short, a number that is not finite, a quaternion that is no rotation.
+on anything else: too short, a number that is not finite, a quaternion that is no rotation, no stamp.
 
 Source: OMG DDS-RTPS 2.5, 10.2 (encapsulation) and the CORBA CDR rules it refers to; REP 103 (units, yaw about +z).
 """
@@ -93,6 +93,14 @@ def _yaw(what: str, x: float, y: float, z: float, w: float) -> float:
     return yaw_of_quaternion(x, y, z, w)
 
 
+def _instant(what: str, sec: float, nanosec: float) -> int:
+    """Stamp [ns]. Raises InvalidMessageError for 0, which a message has whose sender set none."""
+    stamp_ns = int(sec) * NS_PER_S + int(nanosec)
+    if stamp_ns == 0:
+        raise InvalidMessageError(f"{what} has the stamp 0, which means 'no time': its sender must set header.stamp")
+    return stamp_ns
+
+
 def _split(stamp_ns: int) -> tuple[int, int]:
     return divmod(stamp_ns, NS_PER_S)
 
@@ -136,12 +144,12 @@ def encode_pose(pose: StampedPose) -> bytes:
 
 
 def decode_pose(data: bytes) -> StampedPose:
-    """geometry_msgs/PoseStamped; theta in (-pi, pi]. Raises InvalidMessageError."""
+    """geometry_msgs/PoseStamped; theta in (-pi, pi]. Raises InvalidMessageError, for the stamp 0, too."""
     order = _order(data)
     layout = _layout(order, "iI", (_string_length(order, data, 8),), "7d", 8)
     sec, nanosec, _, _, x, y, _, qx, qy, qz, qw = _unpack(layout, data)
     _finite("pose", (x, y))
-    return StampedPose(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("pose", qx, qy, qz, qw))
+    return StampedPose(_instant("pose", sec, nanosec), x, y, _yaw("pose", qx, qy, qz, qw))
 
 
 def encode_transform(pose: StampedPose, child: str) -> bytes:
@@ -167,12 +175,12 @@ def encode_twist(command: Command) -> bytes:
 
 
 def decode_command(data: bytes) -> Command:
-    """geometry_msgs/TwistStamped. Raises InvalidMessageError."""
+    """geometry_msgs/TwistStamped. Raises InvalidMessageError, for the stamp 0, too."""
     order = _order(data)
     layout = _layout(order, "iI", (_string_length(order, data, 8),), "6d", 8)
     sec, nanosec, _, _, v, _, _, _, _, w = _unpack(layout, data)
     _finite("command", (v, w))
-    return Command(int(sec) * NS_PER_S + int(nanosec), v, w)
+    return Command(_instant("command", sec, nanosec), v, w)
 
 
 def _odometry_layout(order: str, frame: int, child: int) -> struct.Struct:
@@ -201,7 +209,7 @@ def decode_error(data: bytes) -> TrackingError:
     values = _unpack(_odometry_layout(order, frame, child), data)
     sec, nanosec, _, _, _, _, x, y, _, qx, qy, qz, qw, v, _, _, _, _, w = values
     _finite("tracking error", (x, y, v, w))
-    return TrackingError(int(sec) * NS_PER_S + int(nanosec), x, y, _yaw("tracking error", qx, qy, qz, qw), v, w)
+    return TrackingError(_instant("message", sec, nanosec), x, y, _yaw("tracking error", qx, qy, qz, qw), v, w)
 
 
 def decode_odometry(data: bytes) -> StampedPose:

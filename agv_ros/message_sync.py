@@ -7,8 +7,9 @@ node computes depends on stamps alone, never on the order of arrival. The error 
 the plant in lockstep commands with downlink slots: this join is the barrier that makes the loop deterministic.
 
 Each topic keeps its order, so step 0 parts one run from the next on either side: its message from the messages before
-it, its slot from the slots before it, whichever of the two comes first. A relay that was started again in between does
-not know what it has passed on before, and names no message: then what the receiver holds is the freshest.
+it, its slot from the slots before it, whichever of the two comes first. A recording that is played again from the
+middle of a run has no step 0: there slots in a row that are long past begin a run. A relay that was started again in
+between does not know what it has passed on before, and names no message: then what the receiver holds is the freshest.
 
 No clock, no thread, no ROS in here: messages go in, pairs that are complete come out.
 """
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from agv_ros.messages import Slot
+from agv_ros.stamps import BACK_NS, Backwards
 
 
 class Stamped(Protocol):
@@ -49,7 +51,7 @@ class MessageSync(Generic[M]):
     """Holds messages and slots until they fit together.
 
     `outdated` counts slots and messages that came too late to matter, or a second time, and were put aside;
-    `unanswered` counts slots whose message never came.
+    `unanswered` counts slots whose message never came, `beginnings` the runs that began with one.
     """
 
     def __init__(self, start_ns: int) -> None:
@@ -60,6 +62,8 @@ class MessageSync(Generic[M]):
         self._settled_ns = 0
         self._last_slot_ns = 0
         self._is_ahead = False  # the messages have begun a run whose slot 0 has not come yet
+        self._back = Backwards(BACK_NS)
+        self.beginnings = 0
         self.outdated = 0
         self.unanswered = 0
 
@@ -85,7 +89,9 @@ class MessageSync(Generic[M]):
 
     def add_slot(self, slot: Slot) -> list[Joined[M]]:
         """Take a slot; returns it, and any before it, once the message that it names is here."""
-        if slot.stamp_ns == self._start_ns:
+        has_gone_back = self._back.has_gone_back(slot.stamp_ns)
+        if slot.stamp_ns == self._start_ns or has_gone_back:
+            self.beginnings += 1
             self._restart()
         elif slot.stamp_ns < self._last_slot_ns:
             self.outdated += 1

@@ -104,11 +104,46 @@ class NearestSteps:
         self._ts_ns = ts_ns
         self._first_ns = 0
         self._last = -1
+        self._back = Backwards(BACK_NS)
 
     def of(self, stamp_ns: int) -> int:
-        """Step of a stamp; one before the first, or more than MAX_LEAP steps past the last, is a new first one."""
+        """Step of a stamp; one before the first, or more than MAX_LEAP steps past the last, is a new first one.
+
+        So is the last of AGREEING stamps in a row that are far behind the newest: the clock has gone back. Raises
+        OffGridError for the stamp 0, which is no time.
+        """
+        if stamp_ns == 0:
+            raise OffGridError("the stamp is 0, which means 'no time': its sender must set header.stamp")
         k = (stamp_ns - self._first_ns + self._ts_ns // 2) // self._ts_ns
-        if self._last < 0 or not 0 <= k <= self._last + MAX_LEAP:
+        if self._back.has_gone_back(stamp_ns) or self._last < 0 or not 0 <= k <= self._last + MAX_LEAP:
             self._first_ns, k = stamp_ns, 0
+            self._back = Backwards(BACK_NS, stamp_ns)
         self._last = k
         return k
+
+
+BACK_NS = NS_PER_S
+"""What is so far [ns] behind the newest stamp was not overtaken on its way."""
+
+
+class Backwards:
+    """Tells a clock that has gone back, as by a reset simulator or a recording that begins again, from late messages.
+
+    It has once AGREEING stamps in a row, each after the one before it, are far behind the newest.
+    """
+
+    def __init__(self, far_ns: int, newest_ns: int = 0) -> None:
+        self._far_ns, self._newest_ns = far_ns, newest_ns
+        self._before_ns, self._agreeing = 0, 0
+
+    def has_gone_back(self, stamp_ns: int) -> bool:
+        """Is this the stamp by which that is known?"""
+        if stamp_ns > self._newest_ns - self._far_ns:
+            self._newest_ns, self._agreeing = max(self._newest_ns, stamp_ns), 0
+            return False
+        follows = self._agreeing > 0 and stamp_ns > self._before_ns
+        self._agreeing, self._before_ns = self._agreeing + 1 if follows else 1, stamp_ns
+        if self._agreeing < AGREEING:
+            return False
+        self._newest_ns, self._agreeing = stamp_ns, 0
+        return True

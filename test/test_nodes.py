@@ -421,6 +421,17 @@ def test_without_slots_the_edge_steps_by_its_clock_and_records_the_age_of_its_po
     assert float(detector.facts()["oldest pose [s]"]) >= 0.2
 
 
+def test_a_pose_without_a_stamp_is_refused_and_the_edge_waits_for_one_that_has_one(bench: Bench) -> None:
+    detector, poses, errors, _ = on_its_own(bench, begin="first_pose")
+    for _ in range(5):
+        poses.publish(wild(pose(0, x=100.0), 0, 0))
+    bench.until(lambda: detector.rejected == {"edge/pose": 5})
+    assert errors == []
+    poses.publish(pose(0, x=-1.0))
+    bench.until(lambda: len(errors) > 0)
+    assert errors[0].pose.pose.position.x == pytest.approx(1.0)
+
+
 def test_a_stamp_from_the_future_is_counted_and_not_believed(bench: Bench) -> None:
     detector, poses, errors, _ = on_its_own(bench)
     for k in (0, 10**6, 10**7):

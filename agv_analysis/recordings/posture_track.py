@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
+from agv_analysis.recordings.clock_steps import clock_steps
 from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.run import Floats
 from agv_ros.errors import UserError
-from agv_ros.messages import yaw_of_quaternion
+from agv_ros.messages import SQUARED_LENGTH, yaw_of_quaternion
 from agv_ros.stamps import NS_PER_S
 
 POSES = {
@@ -84,25 +85,42 @@ def read_poses(bag: Bag, topic: str, what: str = "pose") -> Track:
 
 
 def yaws_of(messages: NDArray[np.void], path: str) -> Floats:
-    """Yaw [rad] in (-pi, pi]; NaN where the quaternion is zero and says nothing. Shape as that of the components."""
+    """Yaw [rad] in (-pi, pi]; NaN where the quaternion is no rotation, as one whose w was never set.
+
+    Shape as that of the components.
+    """
     components = [messages[f"{path}.orientation.{axis}"] for axis in "xyzw"]
     yaws = [yaw_of_quaternion(*q) for q in zip(*(part.ravel().tolist() for part in components), strict=True)]
-    has_orientation = np.any(components, axis=0)
-    return np.where(has_orientation, np.reshape(yaws, has_orientation.shape), np.nan)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared = sum(part**2 for part in components)
+    is_rotation = np.abs(squared - 1.0) < SQUARED_LENGTH
+    return np.where(is_rotation, np.reshape(yaws, is_rotation.shape), np.nan)
 
 
 def in_order(track: Track, where: str, topic: str) -> Track:
-    """Only finite postures, each with a stamp later than all before it: an edge ignores what is older than it holds."""
+    """Only finite postures, each with a stamp later than all before it: an edge ignores what is older than it holds.
+
+    The stamp 0 is no time. Raises UserError if nothing is left, or if the clock was set meanwhile.
+    """
+    stamped = track.stamps != 0
+    if not stamped.any():
+        raise UserError(f"{where}: all its {len(stamped)} stamps are 0, no time: their sender must set header.stamp")
     finite = np.isfinite(track.x + track.y + track.theta + track.v + track.w)
-    usable = track.chosen(finite)
+    usable = track.chosen(finite & stamped)
     if not len(usable.stamps):
         raise UserError(f"{where}: none of its {len(finite)} poses has finite numbers and an orientation")
+    for row, step in clock_steps(usable.stamps, usable.log_times):
+        raise UserError(
+            f"{where}: the clock of its stamps was set by {step / NS_PER_S:+.3f} s against the log times, after the "
+            f"stamp {usable.stamps[row - 1] / NS_PER_S:.3f} s: cut the recording there, and analyse the parts"
+        )
     newest = np.maximum.accumulate(usable.stamps)
     later = np.concatenate(([True], usable.stamps[1:] > newest[:-1]))
     repeated = np.count_nonzero(usable.stamps[1:] == newest[:-1])
     backwards = len(later) - np.count_nonzero(later) - repeated
     counts = (
-        (len(finite) - np.count_nonzero(finite), "poses are not finite or have no orientation"),
+        (len(stamped) - np.count_nonzero(stamped), "stamps are 0, which is no time"),
+        (np.count_nonzero(stamped & ~finite), "poses are not finite or have no orientation"),
         (repeated, "stamps repeat the one before"),
         (backwards, "stamps go backwards"),
     )

@@ -12,6 +12,7 @@ from agv_analysis.recordings.loop_timing import is_more_than_jitter, late_senten
 from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.recordings.posture_track import Track
 from agv_analysis.recordings.receive_times import MAX_RATE, ClockLine, clock_line, newest_held, says_nothing
+from agv_analysis.recordings.robot_commands import clock_ahead
 from agv_analysis.run import Run, Timing
 from agv_ros.stamps import NS_PER_S
 
@@ -75,6 +76,8 @@ def _commands_behind(bag: Bag, topic: str | None, came: Track, run: Run) -> tupl
         return None, 0
     messages = bag[topic]
     stamps, log_times = stamps_of(messages), np.asarray(messages[LOG_TIME], dtype=np.int64)
+    if not stamps.all() or clock_ahead(bag, topic, came):
+        return None, 0
     if len(np.unique(stamps)) < len(stamps) / 2 or says_nothing(stamps, log_times):
         return None, 0
     order = np.argsort(stamps, kind="stable")

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from agv_analysis.recordings.jittered_steps import jittered_steps
 from agv_analysis.recordings.messages_on_steps import Steps
 from agv_analysis.run import Floats
 from agv_ros.errors import UserError
@@ -14,6 +15,10 @@ from agv_ros.stamps import MAX_LEAP, NS_PER_S
 
 _SAME_PERIOD = 0.01
 """Largest relative difference between the params file's period and the stamps' that goes without saying."""
+
+
+_CLEAR = 0.35
+"""Where no gap is further from whole periods than this [periods], each tells by itself how many it is."""
 
 
 class Sampling(NamedTuple):
@@ -30,6 +35,8 @@ class Sampling(NamedTuple):
 def sampling_of(stamps: Steps, where: str) -> Sampling:
     """Sampling of poses with increasing `stamps` [ns]; a gap of m periods is m steps, so m - 1 poses are lost.
 
+    Where the stamps scatter by so much that gaps are not clear, all of them together tell their steps.
+
     Raises UserError if there are too few poses or a gap that no outage explains.
     """
     if len(stamps) < 3:
@@ -45,6 +52,9 @@ def sampling_of(stamps: Steps, where: str) -> Sampling:
             "one recording, by one clock?"
         )
     k = np.concatenate(([0], np.cumsum(steps)))
+    if np.abs(gaps / period - steps).max() > _CLEAR:
+        k = jittered_steps(stamps, period)
+        steps = np.diff(k)
     mean = float(stamps[-1] - stamps[0]) / float(k[-1])
     return Sampling(mean, k, gaps - steps * mean)
 

@@ -79,3 +79,24 @@ def test_an_agv_that_starts_anew_is_followed() -> None:
         assert taken == (k >= IN_A_ROW)
     assert (freshest.beginnings, freshest.first_ns, freshest.future) == (2, 10**9 + IN_A_ROW * TS, 0)
     assert freshest.time(10**10 + 9 * TS) == 10**9 + 9 * TS
+
+
+def test_a_clock_that_is_reset_with_the_stamps_is_followed_at_once() -> None:
+    """A simulator's: both go back, by however much, and the next pose begins a run."""
+    for back in (2 * TS, HOUR):
+        freshest, start = FreshestPose(TS), 2 * HOUR
+        for k in range(100):
+            assert freshest.offer(pose(start + k * TS), start + k * TS)
+        now = start + 100 * TS - back - 3 * TS
+        assert freshest.offer(pose(now), now)
+        assert (freshest.beginnings, freshest.first_ns, freshest.time(now)) == (2, now, now)
+        assert freshest.offer(pose(now + TS), now + TS)
+        assert (freshest.beginnings, freshest.outdated) == (2, 0)
+
+
+def test_an_own_clock_that_was_set_back_begins_no_run() -> None:
+    freshest = FreshestPose(TS)
+    for k in range(100):
+        set_back = 300 * MS if k > 50 else 0
+        assert freshest.offer(pose(10**9 + k * TS), HOUR + k * TS - set_back)
+    assert freshest.beginnings == 1

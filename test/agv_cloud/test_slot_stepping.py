@@ -83,3 +83,15 @@ def test_a_prediction_waits_for_the_command_of_the_step_before_unless_the_next_s
 def test_a_stamp_beside_the_grid_is_no_step() -> None:
     with pytest.raises(OffGridError):
         SlotStepping(GRID).step_of(GRID.stamp(3) + 1)
+
+
+def test_a_recording_that_is_played_again_from_its_middle_begins_a_run() -> None:
+    """Without a step 0: after ten slots that are long past, the edge goes on with them."""
+    stepping, of, answered = SlotStepping(GRID), estimator("hold"), []
+    for _ in range(2):
+        for k in range(1000, 1400):
+            stepping.add_pose(pose(k))
+            stepping.add_slot(Slot(GRID.stamp(k), GRID.stamp(k), DELIVERED))
+            answered += [step for step, _ in steps_of(stepping, of)]
+    assert answered == [*range(1000, 1400), *range(1010, 1400)]
+    assert stepping.beginnings == 1

@@ -8,7 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agv_ros.stamps import AGREEING, MAX_FIRST, MAX_LEAP, Grid, NearestSteps, OffGridError, Steps, to_nanoseconds
+from agv_ros.stamps import (
+    AGREEING,
+    BACK_NS,
+    MAX_FIRST,
+    MAX_LEAP,
+    Backwards,
+    Grid,
+    NearestSteps,
+    OffGridError,
+    Steps,
+    to_nanoseconds,
+)
 
 grids = st.builds(Grid, st.integers(1, 2 * 10**18), st.integers(1000, 10**10))
 
@@ -106,3 +117,22 @@ def test_stamps_off_the_grid_count_for_the_nearest_step_since_the_first() -> Non
     assert steps.of(first - 500) == 0  # its clock began anew
     assert steps.of(first - 480) == 1
     assert steps.of(first + 20 * (MAX_LEAP + 100)) == 0  # or leapt
+
+
+def test_a_robot_whose_clock_goes_back_begins_anew_after_ten_stamps() -> None:
+    steps, ts = NearestSteps(20_000_000), 20_000_000
+    first = [steps.of(10**9 + k * ts) for k in range(500)]
+    assert first == list(range(500))
+    again = [steps.of(10**9 + (k + 3) * ts) for k in range(100)]
+    assert again[:9] == list(range(3, 12))  # they may have been late
+    assert again[9:] == list(range(91))
+
+
+def test_late_messages_begin_nothing() -> None:
+    back = Backwards(BACK_NS)
+    assert not any(back.has_gone_back(ns * 10**7) for k in range(1000) for ns in (k, k - 300, k - 7))
+
+
+def test_the_stamp_zero_is_no_time() -> None:
+    with pytest.raises(OffGridError, match="no time"):
+        NearestSteps(20_000_000).of(0)
