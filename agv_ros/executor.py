@@ -12,12 +12,6 @@ from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
-DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-"""Environment variable of ROS 2: which participants find each other."""
-
-# The loop is one machine's business unless its user says otherwise; set before rclpy makes its first participant.
-os.environ.setdefault(DISCOVERY_RANGE, "LOCALHOST")
-
 import rclpy
 from builtin_interfaces.msg import Time as TimeMessage
 from rcl_interfaces.msg import Log
@@ -29,6 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
 
+from agv_ros.discovery import discovery_note
 from agv_ros.errors import UserError, open_text
 from agv_ros.node import LoopNode
 
@@ -134,17 +129,6 @@ def add(executor: Executor, node: LoopNode[Any]) -> None:
     """Let an executor run a node, in all DDS domains that it is in."""
     for side in (node, *node.sides):
         executor.add_node(side)
-
-
-def discovery_note() -> str:
-    """Who can find the nodes of this process, and how to change that."""
-    range_ = os.environ[DISCOVERY_RANGE]
-    whom = {
-        "LOCALHOST": f"this host alone finds the loop; with {DISCOVERY_RANGE}=SUBNET other hosts do",
-        "OFF": "no other process finds the loop",
-        "SUBNET": "every host of the network finds the loop and can send it messages",
-    }.get(range_, "the middleware's own default holds")  # fmt: skip
-    return f"discovery: {DISCOVERY_RANGE}={range_}, {whom}"
 
 
 def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = None) -> None:

@@ -78,7 +78,7 @@ def command(
         from agv_analysis.runtime.run_setup import OnDisk
         from agv_analysis.runtime.runner import run_in_process
     from agv_analysis.commands.progress import step_bar
-    from agv_ros.executor import discovery_note
+    from agv_ros.discovery import discovery_note
 
     click.echo(discovery_note(), err=True)
     with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
