@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from agv_analysis.recordings.recording import read_run
+from agv_analysis.runtime.shared_memory import held_by, leftovers
 from agv_ros.errors import UserError
 
 NODES = ("runner", "recorder", "controller", "error_detector", "relay", "plant")
@@ -61,6 +62,8 @@ class Ended(NamedTuple):
     """From the signal to the end."""
     orphans: tuple[str, ...]
     """Processes of the run that outlived it."""
+    left: tuple[Path, ...]
+    """Files in shared memory that the process had which got the signal, and that no process uses any more."""
 
 
 def cases() -> Iterator[Case]:
@@ -77,7 +80,7 @@ def run(case: Case, folder: Path, params: str) -> Ended:
     runner = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
-    family = {}
+    family, held = {}, []
     try:
         _until(runner, lambda: len(_children(runner.pid)) == len(NODES) - 1)
         family = _children(runner.pid)
@@ -85,6 +88,7 @@ def run(case: Case, folder: Path, params: str) -> Ended:
         if share is not None:
             _until(runner, lambda: _recorded(folder / "bag") > share * steps * _BYTES_A_STEP)
         victim = runner.pid if case.node == "runner" else family[case.node]
+        held = held_by(victim)
         with contextlib.suppress(ProcessLookupError):
             os.kill(victim, case.number)
             if case.number == signal.SIGSTOP:
@@ -94,7 +98,9 @@ def run(case: Case, folder: Path, params: str) -> Ended:
         said, _ = runner.communicate(timeout=_PATIENCE)
         _until(None, lambda: not any(map(_runs, family.values())), 4.0)
         seconds = time.monotonic() - begun
-        return Ended(runner.returncode, said, seconds, tuple(n for n, pid in family.items() if _runs(pid)))
+        left = {one.path for one in leftovers(settled=0.0)}.intersection(held)
+        orphans = tuple(n for n, pid in family.items() if _runs(pid))
+        return Ended(runner.returncode, said, seconds, orphans, tuple(sorted(left)))
     finally:
         for pid in [runner.pid, *family.values()]:
             with contextlib.suppress(ProcessLookupError):
@@ -107,6 +113,8 @@ def run(case: Case, folder: Path, params: str) -> Ended:
 def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
     """What is not as it should be, in words; empty if all is."""
     found = [f"{node} outlived the run" for node in ended.orphans]
+    if case.number == signal.SIGKILL and case.node != "runner" and case.moment != "start":
+        found += [f"left {path}" for path in ended.left]
     if ended.seconds > IN_TIME and case.number != signal.SIGSTOP:
         found.append(f"ended after {ended.seconds:.1f} s")
     if "Traceback" in ended.said:

@@ -39,7 +39,7 @@ def command(json_file: Path | None, fix: bool, seconds: float) -> None:
       agv-ncs doctor --fix
     """
     from agv_analysis.doctor.examination import examine
-    from agv_analysis.doctor.shared_memory import remove
+    from agv_analysis.runtime.shared_memory import remove
 
     found = examine(seconds)
     if fix:

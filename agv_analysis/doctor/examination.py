@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from agv_analysis.doctor import extras, machine, network
-from agv_analysis.doctor.shared_memory import Leftover, leftovers
 from agv_analysis.doctor.timed_loop import TimedLoop, on_dds, on_timer
+from agv_analysis.runtime.shared_memory import Leftover, leftovers
 from agv_analysis.version import version
 
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from agv_analysis.runtime.executables import NODE_MODULES
 from agv_analysis.runtime.outcome import Outcome
 from agv_analysis.runtime.run_setup import AS_USUAL, OnDisk, params_file, recording_of, scenario_that_waits
 from agv_analysis.runtime.runner import Progress, run_fleet
+from agv_analysis.runtime.shared_memory import leftovers, remove
 from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.plant_node import progress_line, progress_of
@@ -39,6 +40,9 @@ _SHORT_TIMEOUT = 0.8
 
 _HURRY_TIMEOUT = 1.0
 """How long [s] a process may take that was asked to stop for the second time."""
+
+_SETTLED = 0.5
+"""A file in shared memory that is younger than this [s] may belong to a process of another run that is starting."""
 
 _LOOK_PERIOD = 0.1
 """How often [s] the processes are looked at while they run."""
@@ -68,6 +72,7 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress, o
             return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
         finally:
             _end(nodes, stop, _STOP_TIMEOUT)
+            _clean_up(nodes.values())
 
 
 def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcome:
@@ -118,6 +123,12 @@ def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None
         process.collect()
 
 
+def _clean_up(processes: Iterable[_Process]) -> None:
+    """Remove what processes that were killed had in shared memory: later runs could hang on it."""
+    if any(process.killed_by for process in processes):
+        remove(leftovers(settled=_SETTLED), _SETTLED)
+
+
 def run_fleet_in_processes(
     fleet: Mapping[str, Scenario], bag: Path | None, progress: Progress, on_disk: OnDisk = AS_USUAL
 ) -> list[Outcome]:
@@ -137,6 +148,7 @@ def run_fleet_in_processes(
                     progress(sum(other.steps for other in vehicles))
         finally:
             _end_all(vehicles, stop, _STOP_TIMEOUT)
+            _clean_up(vehicles)
         outcomes = [_outcome_of(vehicle, stop.requested) for vehicle in vehicles]
         progress(sum(outcome.steps for outcome in outcomes))
         return outcomes

@@ -12,6 +12,7 @@ import os
 import re
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +38,13 @@ class Leftover(NamedTuple):
     def to_json(self) -> dict[str, Any]:
         """As the JSON file has it."""
         return {"path": str(self.path), "size": self.size, "mine": self.mine}
+
+
+def held_by(process: int, folder: Path = SHARED_MEMORY) -> list[Path]:
+    """Files of DDS in `folder` that a process has mapped or open, as far as this user may see them."""
+    return sorted(
+        {folder / name for name in _used_by(Path(f"/proc/{process}"), str(folder)) if _OF_DDS.fullmatch(name)}
+    )
 
 
 def leftovers(folder: Path = SHARED_MEMORY, settled: float = SETTLED) -> list[Leftover]:
@@ -94,9 +102,12 @@ def _is_locked(path: Path) -> bool:
 def _in_use(folder: str) -> Iterator[str]:
     """Names of the files in `folder` that processes have mapped or open, as far as this user may see them."""
     for process in Path("/proc").glob("[0-9]*"):
-        try:
-            yield from re.findall(rf" {re.escape(folder)}/(.+)$", (process / "maps").read_text(), re.MULTILINE)
-            files = [descriptor.readlink() for descriptor in (process / "fd").iterdir()]
-            yield from (file.name for file in files if str(file.parent) == folder)
-        except OSError:  # it has ended, or is another user's
-            continue
+        yield from _used_by(process, folder)
+
+
+def _used_by(process: Path, folder: str) -> Iterator[str]:
+    """The same of one process; none of one that has ended, or is another user's."""
+    with suppress(OSError):
+        yield from re.findall(rf" {re.escape(folder)}/(.+)$", (process / "maps").read_text(), re.MULTILINE)
+        files = [descriptor.readlink() for descriptor in (process / "fd").iterdir()]
+        yield from (file.name for file in files if str(file.parent) == folder)

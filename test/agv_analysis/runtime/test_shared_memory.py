@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from agv_analysis.doctor.shared_memory import SHARED_MEMORY, Leftover, leftovers, remove
+from agv_analysis.runtime.shared_memory import SHARED_MEMORY, Leftover, leftovers, remove
 
 USER = """
 import fcntl, mmap, sys
