@@ -12,23 +12,19 @@ from typing import Any
 
 from agv_analysis.corridor.widths import widths_of
 from agv_analysis.explore.background_criteria import (
+    SURE,
+    WORD,
     LatestOnlyWorker,
     WorkerDiedError,
     compared_criteria_rows,
     tube_traces,
 )
 from agv_analysis.explore.guard import check_request, guard, said
+from agv_analysis.explore.layout import SHOWN_FOR_A_LAW, STYLE, layout, styles_of
+from agv_analysis.explore.positions import difference, from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, Values, preset_values, scenario_of, values_of
-from agv_analysis.explore.sliders import (
-    CHOICES,
-    GAIN_SLIDERS,
-    LOOK_AHEAD,
-    LOOKING_AHEAD,
-    OTHER_SLIDERS,
-    SLIDERS,
-    Slider,
-)
+from agv_analysis.explore.sliders import CHANNEL_SLIDERS, CHOICES, SLIDERS, acts
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -36,35 +32,6 @@ HOST = "127.0.0.1"
 
 KEYS = (*(slider.key for slider in SLIDERS), *CHOICES, "more")
 """Everything on the page that can be set, in the order in which it comes to a callback."""
-
-STYLE = """
-:root { color-scheme: light dark; --paper: #fff; --ink: #1b1f24; --soft: #5b6570; --line: #d9dee3; --bad: #cf222e }
-@media (prefers-color-scheme: dark) {
-  :root { --paper: #14171a; --ink: #e6e9ec; --soft: #9aa4ae; --line: #343b42; --bad: #ff7b72 }
-  :root, .dash-dropdown-content {
-    --Dash-Fill-Inverse-Strong: #14171a; --Dash-Text-Primary: #e6e9ec; --Dash-Text-Strong: #e6e9ec;
-    --Dash-Text-Weak: #9aa4ae; --Dash-Stroke-Strong: #5b6570; --Dash-Stroke-Weak: #343b42;
-    --Dash-Text-Disabled: #9aa4ae; --Dash-Fill-Disabled: #5b6570; --Dash-Fill-Weak: #343b42;
-    --Dash-Fill-Primary-Hover: #343b42; --Dash-Fill-Primary-Active: #343b42;
-  }
-}
-body { margin: 0; font: 15px/1.4 system-ui, sans-serif; color: var(--ink); background: var(--paper) }
-main { display: flex; flex-wrap: wrap; gap: 1rem; padding: 1rem; max-width: 1400px; margin: auto }
-#controls { flex: 1 1 300px; max-width: 420px } #shown { flex: 3 1 560px; min-width: 0 }
-#problem { color: var(--bad); min-height: 1.4em; white-space: pre-wrap } h1 { font-size: 1.2rem; margin: 0 0 .5rem }
-label { display: block; font-size: .85rem; color: var(--soft); margin-top: .3rem }
-button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
-th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
-pre { white-space: pre-wrap } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
-table:has(td + td)::before {
-  content: "right: the pinned setting"; display: table-caption; text-align: right; font-size: .85rem; color: var(--soft)
-}
-@media (max-width: 600px) { th, td { padding-right: .4rem; font-size: .85rem } td { overflow-wrap: anywhere } }
-#lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
-.js-plotly-plot .main-svg text:not(.hovertext *) { fill: var(--ink) !important }
-.js-plotly-plot .gridlayer path { stroke: var(--line) !important }
-"""
-
 
 CriteriaRows = Callable[[Scenario, Scenario | None], list[tuple[str, str, str]] | None]
 """As `compared_criteria_rows`; None if the setting was moved on before its turn came."""
@@ -74,12 +41,6 @@ TubeTraces = Callable[[Scenario], list[dict[str, Any]] | None]
 
 _REST = 0.3
 """Seconds for which the page has to be left alone before the lap's criteria are computed."""
-
-_AGAIN, _PAUSE = 4, 400
-"""How often a page that was loaded is drawn anew, and after how many milliseconds each.
-
-A browser compiles what it has run some times: so it has before a hand moves the first slider.
-"""
 
 _DIED = [("Not computed", "the process that computes it ended; the next move starts another", "")]
 
@@ -101,106 +62,72 @@ def build(
         "agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets", url_base_pathname=path
     )
     app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
-    app.layout = _layout(dash, values_of(base))
+    app.layout = layout(dash, values_of(base))
     _connect(dash, app, base, criteria, tube)
     return app
-
-
-def _layout(dash: Any, at_first: dict[str, Any]) -> Any:
-    html, dcc = dash.html, dash.dcc
-    controls = [html.H1("What if?")]
-    controls += [html.Button(preset.title, id=f"preset-{key}") for key, preset in PRESETS.items()]
-    controls.append(html.P("", id="story"))
-    for key, choice in CHOICES.items():
-        controls += [html.Label(choice.label), dcc.Dropdown(list(choice.names), at_first[key], id=key, clearable=False)]
-
-    def of(sliders: tuple[Slider, ...]) -> list[Any]:
-        return [part for one in sliders for part in (html.Label(one.label), _slider(dcc, one, at_first[one.key]))]
-
-    styles = dict(zip(SHOWN_FOR_A_LAW, _styles(at_first["law"]), strict=True))
-    sliders_of_groups = {**{_group(law): sliders for law, sliders in GAIN_SLIDERS.items()}, _AHEAD: (LOOK_AHEAD,)}
-    controls += [html.Div(of(sliders), id=key, style=styles[key]) for key, sliders in sliders_of_groups.items()]
-    controls += of(OTHER_SLIDERS)
-    example = "further settings, one a line:\nplant.duration=50.0\nrelay.downlink.model=bernoulli"
-    controls += [html.Label("more"), dcc.Textarea(id="more", value="", placeholder=example, rows=3)]
-    shown = [
-        html.Div(
-            [
-                html.Button("Pin this setting", id="pin"),
-                html.Button("Unpin", id="unpin"),
-                html.Button("Export", id="export"),
-            ]
-        ),
-        html.Div("", id="problem", role="alert"),
-        html.Table([], id="summary"),
-        html.H2("Over the whole lap"),
-        html.Table([], id="lap"),
-        dcc.Graph(id="plot-track", style={"height": "420px"}, config={"displaylogo": False}),
-        dcc.Graph(id="plot-time", style={"height": "620px"}, config={"displaylogo": False}),
-        html.Pre("", id="exported"),
-        dcc.Download(id="file"),
-        dcc.Store(id="pinned"),
-        dcc.Store(id="tube"),
-        dcc.Interval(id="again", interval=_PAUSE, max_intervals=_AGAIN),
-    ]
-    return html.Main([html.Div(controls, id="controls"), html.Div(shown, id="shown")])
-
-
-def _group(law: str) -> str:
-    """Id of what holds the sliders of a law's gains."""
-    return f"gains-of-{law}"
-
-
-_AHEAD = "sliders-ahead"
-
-SHOWN_FOR_A_LAW = (*map(_group, GAIN_SLIDERS), _AHEAD)
-"""Ids of what is shown for some laws only."""
-
-
-def _styles(law: str) -> list[dict[str, str]]:
-    """Whether each of SHOWN_FOR_A_LAW is, where a law is chosen."""
-    shown = [*(name == law for name in GAIN_SLIDERS), law in LOOKING_AHEAD]
-    return [{} if is_shown else {"display": "none"} for is_shown in shown]
-
-
-def _slider(dcc: Any, slider: Slider, value: float) -> Any:
-    ends = {end: f"{end:g}" for end in (slider.low, slider.high)}
-    return dcc.Slider(slider.low, slider.high, slider.step, value=value, marks=ends, id=slider.key, updatemode="drag")
 
 
 def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: TubeTraces) -> None:
     Input, Output, State = dash.Input, dash.Output, dash.State
     inputs, states = [Input(key, "value") for key in KEYS], [State(key, "value") for key in KEYS]
 
-    folder = Path.cwd()
+    folder, at_first = Path.cwd(), values_of(base)
+    presets = {key: preset_values(base, key) for key in PRESETS}
 
     def values(given: tuple[Any, ...]) -> dict[str, Any]:
-        return dict(zip(KEYS, given, strict=True))
+        return {key: value_of(key, at, at_first) for key, at in zip(KEYS, given, strict=True)}
 
     def asked(settings: Values) -> Scenario:
         return check_request(base, scenario_of(base, settings), folder)
 
     @app.callback(
         Output("plot-track", "figure"), Output("plot-time", "figure"), Output("summary", "children"),
-        Output("problem", "children"), Output("lap", "className"),
+        Output("problem", "children"), Output("lap", "className"), Output("badge-word", "className"),
+        *(Output(f"badge-{part}", "children") for part in _BADGE), Output("pinned-name", "children"),
+        Output("story", "children"), Output("setting", "data"),
+        *(Output(f"{slider.key}-value", "children") for slider in _LOG_SLIDERS),
         *inputs, Input("pinned", "data"), Input("again", "n_intervals"),
     )  # fmt: skip
     def move(*given: Any) -> Any:
         *settings, pinned, _ = given
+        now = values(tuple(settings))
+        story = next((PRESETS[key].text for key, preset in presets.items() if preset == now), "")
+        of_setting = (
+            "" if pinned is None else difference(now, pinned), story, to_hash(now, at_first),
+            *(f"{now[slider.key]:g}" for slider in _LOG_SLIDERS),
+        )  # fmt: skip
         try:
-            other = None if pinned is None else asked(pinned)
-            found = respond(asked(values(tuple(settings))), other)
+            found = respond(asked(now), None if pinned is None else asked(pinned))
         except UserError as error:
-            return dash.no_update, dash.no_update, dash.no_update, said(error), "old"
+            return *[dash.no_update] * 3, said(error), "old", "old", *[dash.no_update] * len(_BADGE), *of_setting
         found.track["layout"]["meta"] = _mark(settings)
-        return found.track, found.time, _table(dash.html, found.rows), "", "old"
-
-    @app.callback(*(Output(key, "style") for key in SHOWN_FOR_A_LAW), Input("law", "value"), prevent_initial_call=True)
-    def show(law: str) -> Any:
-        return _styles(law)
+        rows = _table(dash.html, found.rows, pinned is not None)
+        return found.track, found.time, rows, "", "old", "old", *(found.badge[part] for part in _BADGE), *of_setting
 
     @app.callback(
-        Output("lap", "children"), Output("lap", "className", allow_duplicate=True),
+        *(Output(key, "style") for key in SHOWN_FOR_A_LAW),
+        *(Output(slider.key, "disabled") for slider in CHANNEL_SLIDERS),
+        *(Output(f"of-{slider.key}", "className") for slider in CHANNEL_SLIDERS),
+        Input("law", "value"), Input("model", "value"), prevent_initial_call=True,
+    )  # fmt: skip
+    def show(law: str, model: str) -> Any:
+        is_off = [not acts(slider, model) for slider in CHANNEL_SLIDERS]
+        return *styles_of(law), *is_off, *("off" if off else "" for off in is_off)
+
+    app.clientside_callback(_TO_URL, Output("in-url", "data"), Input("setting", "data"), prevent_initial_call=True)
+    app.clientside_callback(_DRAWER, Output("drawer", "open"), Input("url", "pathname"))
+
+    @app.callback(
+        *(Output(key, "value", allow_duplicate=True) for key in KEYS), Input("url", "hash"),
+        prevent_initial_call="initial_duplicate",
+    )  # fmt: skip
+    def from_url(text: str | None) -> Any:
+        found = {**at_first, **from_hash(text or "", at_first)}
+        return [position_of(key, found[key]) for key in KEYS]
+
+    @app.callback(
+        Output("lap", "children"), Output("lap", "className", allow_duplicate=True), Output("badge-word", "children"),
+        Output("badge-word", "className", allow_duplicate=True), Output("badge-sure", "children"),
         Input("problem", "children"), *states, State("pinned", "data"), prevent_initial_call=True,
     )  # fmt: skip
     def over_the_lap(_: Any, *given: Any) -> Any:  # after `move` has answered, so as not to keep it from that
@@ -209,10 +136,14 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
             scenario = asked(values(tuple(settings)))
             found = criteria(scenario, None if pinned is None else asked(pinned))
         except UserError:  # `move` says why
-            return [], ""
+            return [], "", "…", "", ""
         except WorkerDiedError:
-            return _table(dash.html, _DIED), ""
-        return _table(dash.html, _MOVED_ON if found is None else found), ""
+            return _table(dash.html, _DIED, False), "", "…", "", ""
+        if found is None:
+            return _table(dash.html, _MOVED_ON, False), "", *[dash.no_update] * 3
+        rows = {name: value for name, value, _ in found}
+        word = rows.get(WORD, "…")
+        return _table(dash.html, found, pinned is not None), "", word, word, rows.get(SURE, "")
 
     @app.callback(Output("tube", "data"), Input("lap", "children"), *states, prevent_initial_call=True)
     def find_tube(_: Any, *given: Any) -> Any:  # after the criteria
@@ -236,25 +167,27 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
         return values(given) if dash.ctx.triggered_id == "pin" else None
 
     @app.callback(
-        *(Output(key, "value") for key in KEYS), Output("story", "children"),
+        *(Output(key, "value") for key in KEYS),
         *(Input(f"preset-{key}", "n_clicks") for key in PRESETS), prevent_initial_call=True,
     )  # fmt: skip
     def preset(*_: Any) -> Any:
         key = dash.ctx.triggered_id.removeprefix("preset-")
-        chosen = preset_values(base, key)
-        return *(chosen[name] for name in KEYS), PRESETS[key].text
+        return [position_of(name, presets[key][name]) for name in KEYS]
 
     @app.callback(
-        Output("exported", "children"), Output("file", "data"), Input("export", "n_clicks"), *states,
+        Output("exported", "children"), Output("file", "data"), Output("export-said", "children"),
+        Input("export", "n_clicks"), *states,
         prevent_initial_call=True,
     )  # fmt: skip
     def export(_: Any, *given: Any) -> Any:
         try:
             text = asked(values(given)).to_yaml()
         except UserError as error:
-            return said(error), dash.no_update
+            return said(error), dash.no_update, ""
         command = "agv-ncs simulate explored.yaml --report explored.html"
-        return f"{command}\n\n# explored.yaml\n{text}", {"content": text, "filename": "explored.yaml"}
+        shown = f"{command}\n\n# explored.yaml\n{text}"
+        where = "explored.yaml is among your browser's downloads, and at the end of this page"
+        return shown, {"content": text, "filename": "explored.yaml"}, where
 
 
 def _mark(settings: Sequence[Any]) -> str:
@@ -267,11 +200,27 @@ _ADD_TUBE = """(tube, figure) => tube && figure && figure.layout.meta === tube.m
 """Adds a tube to the figure of the track, unless that is another setting's by now: the browser alone knows it."""
 
 
-def _table(html: Any, rows: list[tuple[str, str, str]]) -> list[Any]:
+def _table(html: Any, rows: list[tuple[str, str, str]], is_pinned: bool) -> list[Any]:
     """Rows with a third cell only where there is something in it: each cell is felt at every move."""
-    return [
+    head = [html.Tr([html.Th(""), html.Th("now"), html.Th("pinned")])] if is_pinned else []
+    return head + [
         html.Tr([html.Th(name), *(html.Td(cell) for cell in (value, other) if cell)]) for name, value, other in rows
     ]
+
+
+_BADGE = ("deviation", "when", "losses", "outage")
+"""Parts of the badge that each move changes."""
+
+_LOG_SLIDERS = tuple(slider for slider in SLIDERS if slider.is_log)
+
+_TO_URL = """function(text) {
+  history.replaceState(history.state, "", location.pathname + location.search + (text ? "#" + text : ""));
+  return text;
+}"""
+"""The address of the page holds its setting, and going back does not go through every move."""
+
+_DRAWER = "function() { return innerWidth > 900; }"
+"""On a phone the drawer is closed at first."""
 
 
 def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:

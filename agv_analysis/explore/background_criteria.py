@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import multiprocessing
 import os
 import resource
@@ -25,6 +26,9 @@ _NICE = 19
 _MOST_MEMORY = 8 * 2**30
 """Most address space [B] of background computations, of which a part is memory."""
 
+WORD, SURE = "In a word", "How sure"
+"""Rows that the badge shows, too."""
+
 _LAPS = 50
 """Laps that are simulated for a corridor."""
 
@@ -43,13 +47,16 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
     """
     from agv_analysis.corridor.corridor import corridor
     from agv_analysis.report.table import margin_rows
+    from agv_analysis.report.tiles import confidence_text
     from agv_analysis.report.verdict_sentence import sentence
     from agv_analysis.simulation.single import simulate
     from agv_analysis.stability.analysis import analyse
 
     try:
         analysis = analyse(simulate(scenario))
-        found = [("Verdict", sentence(analysis))]
+        found = [("Verdict", sentence(analysis)), (WORD, analysis.verdict.word)]
+        if analysis.evidence.confidence is not None:
+            found.append((SURE, confidence_text(analysis.evidence.confidence)))
         if analysis.floquet is not None:
             found.append(("This loss sequence (Floquet)", _growth(analysis.floquet)))
         within = corridor(scenario, _LAPS, proved=False)
@@ -82,6 +89,8 @@ def tube_traces(scenario: Scenario) -> list[dict[str, Any]]:
 
 def _growth(factor: float) -> str:
     """Whether errors that grow by a factor a step die out, in words."""
+    if not math.isfinite(factor):
+        return "unstable: diverges"
     if factor < 1.0:
         return f"stable: errors shrink by {100.0 * (1.0 - factor):.2g} % per step"
     return f"unstable: errors grow by {100.0 * (factor - 1.0):.2g} % per step"

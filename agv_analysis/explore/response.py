@@ -13,10 +13,11 @@ from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.single_outage import FEW_PLACES, LONGEST, roughly
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.metrics.convergence import convergence
-from agv_analysis.metrics.deviation import deviation
-from agv_analysis.report.panels import LIMIT, OTHER, REFERENCE, Panel, age, distance, speed, track
+from agv_analysis.metrics.deviation import Deviation, deviation
+from agv_analysis.metrics.outages import outage_lengths
+from agv_analysis.report.panels import LIMIT, OTHER, PINNED, REFERENCE, Panel, age, distance, speed, track
 from agv_analysis.report.plotly import figure
-from agv_analysis.report.table import at_most, deviation_sizes
+from agv_analysis.report.table import at_most, deviation_sizes, metres
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
@@ -38,6 +39,8 @@ class Response(NamedTuple):
     time: dict[str, Any]
     rows: list[tuple[str, str, str]]
     """Name, value, and that of the pinned setting, empty without one."""
+    badge: dict[str, str]
+    """What the badge says at once, by the name of its part: deviation, when, losses, outage."""
 
 
 def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
@@ -46,13 +49,27 @@ def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
     other, values_of_other = (None, None) if pinned is None else _kept(with_channel_of(pinned, scenario))
     first = beside(track(run), None if other is None else track(other))
     over_time = [beside(panel(run), None if other is None else panel(other)) for panel in (distance, speed, age)]
-    values = list(summary_rows(run))
+    strays = deviation(run, convergence(run).initial)
+    values = list(summary_rows(run, strays))
     others = values_of_other or {}
     return Response(
         track=figure([first], MOST_POINTS, markers=_MOST_MARKERS),
         time=figure(over_time, MOST_POINTS),
         rows=[(name, value, others.get(name, "")) for name, value in values],
+        badge=_badge(run, strays),
     )
+
+
+def _badge(run: Run, strays: Deviation) -> dict[str, str]:
+    lengths = outage_lengths(run.k, run.lost)
+    longest = int(lengths.max(initial=0))
+    worst = next(iter(strays.worst), None)
+    return {
+        "deviation": metres(strays.largest),
+        "when": strays.reason if worst is None else f"at {worst.seconds:g} s",
+        "losses": f"{100.0 * float(run.lost.mean()):.3g} %",
+        "outage": f"longest outage {longest} slots ({longest * run.ts * 1e3:g} ms)",
+    }
 
 
 @functools.lru_cache(maxsize=4)
@@ -73,7 +90,7 @@ def beside(panel: Panel, pinned: Panel | None) -> Panel:
     shown = tuple(line for line in panel.lines if line.role != OTHER)
     if pinned is not None:
         line = next(line for line in pinned.lines if line.role not in (REFERENCE, LIMIT))
-        shown += (dataclasses.replace(line, name="pinned", role=OTHER),)
+        shown += (dataclasses.replace(line, name="pinned", role=PINNED),)
         panel = dataclasses.replace(panel, y_range=_both(panel.y_range, pinned.y_range))
     return dataclasses.replace(panel, lines=shown)
 
@@ -83,13 +100,16 @@ def _both(one: tuple[float, float] | None, other: tuple[float, float] | None) ->
     return None if one is None or other is None else (min(one[0], other[0]), max(one[1], other[1]))
 
 
-def summary_rows(run: Run) -> Iterator[tuple[str, str]]:
-    """What a run tells, and what the criteria say at once; the rest is left to the criteria for the whole lap."""
+def summary_rows(run: Run, strays: Deviation | None = None) -> Iterator[tuple[str, str]]:
+    """What a run tells, and what the criteria say at once; the rest is left to the criteria for the whole lap.
+
+    `strays`: the run's deviation, where it is known already.
+    """
     facts = RunFacts(run)
     e = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)
     late = float(e[-max(1, len(e) // 10) :].max())
     yield "Error in the last tenth", "; ".join((at_most(late), *run.notes))
-    yield "Deviation", deviation_sizes(deviation(run, convergence(run).initial))
+    yield "Deviation", deviation_sizes(strays or deviation(run, convergence(run).initial))
     yield "Oldest pose", f"{facts.n} steps ({facts.n * run.ts * 1e3:g} ms)"
     if not facts.is_feasible:
         yield "Without losses", facts.infeasible

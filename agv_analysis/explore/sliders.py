@@ -13,6 +13,9 @@ from agv_plant.channels.registry import CHANNELS, MODELS
 from agv_plant.vehicle.registry import VEHICLES
 from agv_ros.parameters import Parameter, parameters_of
 
+_LOG_STEPS, _LOG_REACH = 300, 1000.0
+"""Steps of a logarithmic slider, and how many times its smallest value the largest is: 2.3 % a step."""
+
 
 @dataclass(frozen=True)
 class Slider:
@@ -29,6 +32,34 @@ class Slider:
     """What the parameter is multiplied with to be shown: 1000 where it is in seconds and shown in milliseconds."""
     open_end: bool = False
     """Is there no limit at the high end?"""
+    is_log: bool = False
+    """Does each step multiply the value? The lowest position stands for the low end all the same, which may be 0."""
+
+    @property
+    def positions(self) -> tuple[float, float, float]:
+        """First and last position of the handle, and its step."""
+        return (0.0, float(_LOG_STEPS), 1.0) if self.is_log else (self.low, self.high, self.step)
+
+    def value_at(self, position: float) -> float:
+        """The value of a position, of a logarithmic slider in three digits."""
+        if not self.is_log:
+            return position
+        if position <= 0.0:
+            return self.low
+        return float(f"{self._smallest * (self.high / self._smallest) ** (position / _LOG_STEPS):.3g}")
+
+    def position_of(self, value: float) -> float:
+        """Where the handle stands for a value."""
+        if not self.is_log:
+            return value
+        if value <= self._smallest:
+            return 0.0
+        share = math.log(value / self._smallest) / math.log(self.high / self._smallest)
+        return round(_LOG_STEPS * min(1.0, share), 3)
+
+    @property
+    def _smallest(self) -> float:
+        return max(self.low, self.high / _LOG_REACH)
 
 
 NO_LIMIT = 20.0
@@ -50,7 +81,8 @@ def gain_slider(key: str, target: str, name: str, known: Parameter) -> Slider:
     step = _round_step((high - low) / _STEPS)
     unit = f" [{known.unit}]" if known.unit else ""
     label = f"{name}{unit}, {high:g}: none" if unlimited else f"{name}{unit}"
-    return Slider(key, label, low + step if low == known.above else low, high, step, target, open_end=unlimited)
+    first, is_log = low + step if low == known.above else low, low >= 0.0 and not unlimited
+    return Slider(key, label, first, high, step, target, open_end=unlimited, is_log=is_log)
 
 
 def _round_step(about: float) -> float:
@@ -71,9 +103,9 @@ def _gain_sliders(law: str) -> tuple[Slider, ...]:
 
 GAIN_SLIDERS: dict[str, tuple[Slider, ...]] = {
     KANAYAMA: (
-        Slider("kx", "K_x [1/s]", 0.0, 400.0, 1.0, "controller.kx"),
-        Slider("ky", "K_y [1/m^2]", 0.0, 20.0, 0.1, "controller.ky"),
-        Slider("ktheta", "K_theta [1/m]", 0.0, 20.0, 0.1, "controller.ktheta"),
+        Slider("kx", "K_x [1/s]", 0.0, 400.0, 1.0, "controller.kx", is_log=True),
+        Slider("ky", "K_y [1/m^2]", 0.0, 20.0, 0.1, "controller.ky", is_log=True),
+        Slider("ktheta", "K_theta [1/m]", 0.0, 20.0, 0.1, "controller.ktheta", is_log=True),
     ),
     **{law: _gain_sliders(law) for law in CONTROL_LAWS.usable() if law != KANAYAMA},
 }
@@ -98,6 +130,16 @@ OTHER_SLIDERS = (
     Slider("delay", "delay of each pose [ms]", 0.0, 500.0, 1.0, "relay.uplink.delay", 1e3),
     Slider("seed", "seed of the outages", 1.0, 100.0, 1.0, "relay.seed"),
 )
+
+CHANNEL_SLIDERS = tuple(slider for slider in OTHER_SLIDERS if slider.key in ("p", "r", "n"))
+"""What only some channels use."""
+
+
+def acts(slider: Slider, model: str) -> bool:
+    """Does a channel model use the parameter of one of CHANNEL_SLIDERS? Its description says which models do."""
+    known = parameters_of(SCHEMAS["relay"])[slider.target.removeprefix("relay.")]
+    return any(clause.startswith(f"{model}: ") for clause in known.description.split("; "))
+
 
 SLIDERS = (*(slider for sliders in GAIN_SLIDERS.values() for slider in sliders), LOOK_AHEAD, *OTHER_SLIDERS)
 """All sliders."""

@@ -17,6 +17,7 @@ from agv_analysis.report.panels import (
     MARKERS,
     OTHER,
     PEAK,
+    PINNED,
     REFERENCE,
     RINGS,
     STEP,
@@ -42,6 +43,7 @@ STYLE: Any = {
 
 COLOURS = {
     REFERENCE: "#7f7f7f", DRIVEN: "#1f6fb4", LOST: "#d62728", OTHER: "#e08214", LIMIT: "black", PEAK: "#7b3fb5",
+    PINNED: "#e08214",
     **dict(zip(DEVIATIONS, ("#1f6fb4", "#1b7f6d", "#a9861a", "#c85f17", "#b3157f"), strict=True)),
 }  # fmt: skip
 

@@ -24,6 +24,9 @@ LINE, STEP, MARKERS, HALOS, RINGS, BARS = "line", "step", "markers", "halos", "r
 REFERENCE, DRIVEN, LOST, OTHER, LIMIT, PEAK = "reference", "driven", "lost", "other", "limit", "peak"
 """What a line stands for, which gives it its colour."""
 
+PINNED = "pinned"
+"""Another run that is held against the first: dotted, so that the two differ without colours as well."""
+
 DEVIATIONS = tuple(f"deviation {i}" for i in range(5))
 """The AGV's path by how far it is from the reference, from near to far."""
 

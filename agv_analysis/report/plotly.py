@@ -21,6 +21,7 @@ from agv_analysis.report.panels import (
     MARKERS,
     OTHER,
     PEAK,
+    PINNED,
     REFERENCE,
     RINGS,
     STEP,
@@ -38,6 +39,7 @@ COLOURS = {
     OTHER: "#e39a2d",
     LIMIT: "#8a8a8a",
     PEAK: "#a06cd5",
+    PINNED: "#e39a2d",
     **dict(zip(DEVIATIONS, ("#3b8bd0", "#1f9e89", "#c9a227", "#e0762a", "#d6249f"), strict=True)),
 }
 """Each is seen on white and on black."""
@@ -159,7 +161,7 @@ def _trace(line: Line, most: int, markers: int) -> dict[str, Any]:
     if line.style == RINGS:
         ring = {"symbol": "circle-open", "size": 14, "color": colour, "line": {"width": 2}}
         return {**trace, "mode": "markers", "marker": ring, **_labels(line)}
-    dash = {"dash": "dash"} if line.role == LIMIT else {}
+    dash = {"dash": {LIMIT: "dash", PINNED: "dot"}[line.role]} if line.role in (LIMIT, PINNED) else {}
     shape = {"shape": "hv"} if line.style == STEP else {}
     width = 3 if line.role in DEVIATIONS else 1.5
     return {**trace, "mode": "lines", "line": {"color": colour, "width": width, **dash, **shape}}

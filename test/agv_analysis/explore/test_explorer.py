@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -30,9 +31,11 @@ from agv_analysis.explore.background_criteria import (
     criteria_rows,
     tube_traces,
 )
+from agv_analysis.explore.positions import from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
-from agv_analysis.explore.sliders import gain_slider
+from agv_analysis.explore.sliders import SLIDERS, gain_slider
+from agv_analysis.report.tiles import confidence_text
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_analysis.simulation.single import simulate
@@ -96,6 +99,28 @@ def test_a_slider_for_a_gain_reaches_from_its_bound_to_four_times_its_default() 
     assert ends(math.inf, None, math.inf, 0.0) == (0.2, 20.0, 0.2)
     limit = Parameter("w_max", "double", math.inf, "rad/s", "limit", None, math.inf, 0.0)
     assert gain_slider("k", "controller.law.w_max", "w_max", limit).label == "w_max [rad/s], 20: none"
+
+
+def test_a_logarithmic_slider_goes_there_and_back_and_leaves_what_was_not_touched(base: Scenario) -> None:
+    kx = next(slider for slider in SLIDERS if slider.key == "kx")
+    assert kx.is_log
+    values = [kx.value_at(position) for position in range(301)]
+    assert (values[0], values[-1]) == (0.0, 400.0)
+    ratios = np.array(values[2:]) / np.array(values[1:-1])
+    assert 1.01 < ratios.min() < ratios.max() < 1.04
+    assert [kx.value_at(kx.position_of(value)) for value in values] == values
+    odd = base.with_settings(["controller.kx=25.0123"], "test")
+    at_first = values_of(odd)
+    untouched = {key: value_of(key, position_of(key, value), at_first) for key, value in at_first.items()}
+    assert scenario_of(odd, untouched) == odd
+
+
+def test_an_address_and_a_setting_say_the_same(base: Scenario) -> None:
+    at_first = values_of(base)
+    now = {**at_first, "kx": 40.5, "track": "eight", "more": "plant.lag=0.1\nplant.duration=9.0"}
+    assert {**at_first, **from_hash(f"#{to_hash(now, at_first)}", at_first)} == now
+    assert to_hash(at_first, at_first) == ""
+    assert from_hash("#kx=NaN&p=true&track=[]&more=5&law=%22x%22&" + "kx=" + "[" * 9999, at_first) == {}
 
 
 def test_what_is_set_for_a_law_goes_with_it(base: Scenario) -> None:
@@ -329,7 +354,7 @@ def test_moving_a_slider_simulates_anew(page: Page) -> None:
     handle = page.slider("kx")
     handle.send_keys(Keys.PAGE_UP)  # ten steps at once
     page.until(lambda: "up to 14 along" not in page.text("summary"))
-    kx = float(handle.get_attribute("aria-valuenow"))
+    kx = float(page.text("kx-value"))
     n = int(np.ceil(2.0 / (0.005 * kx)) - 2.0)  # T_s K_x L < 2 with L = n + 1
     assert kx > 25.0
     page.until(lambda: f"up to {n} along" in page.text("summary"))
@@ -351,7 +376,7 @@ def test_a_law_brings_its_own_sliders(page: Page) -> None:
     def shown() -> list[str]:
         return [key for key in SHOWN_FOR_A_LAW if page.chrome.find_element("id", key).is_displayed()]
 
-    from agv_analysis.explore.app import SHOWN_FOR_A_LAW
+    from agv_analysis.explore.layout import SHOWN_FOR_A_LAW
 
     assert shown() == ["gains-of-kanayama"]
     choose(page, "law", "pure_pursuit")
@@ -359,10 +384,12 @@ def test_a_law_brings_its_own_sliders(page: Page) -> None:
     page.slider("pure_pursuit-kx").send_keys(Keys.PAGE_UP)
     page.slider("look_ahead").send_keys(Keys.ARROW_LEFT)
     page.until(lambda: page.slider("look_ahead").get_attribute("aria-valuenow") == "490")
+    page.until(lambda: page.text("pure_pursuit-kx-value") != "2")
     page.click("export")
     page.until(lambda: "law: pure_pursuit" in page.text("exported"))
     found = parse_scenario(page.text("exported").partition("\n\n")[2], "exported")
-    assert found.controller.gains == (3.0, 0.1)
+    assert found.controller.gains == (float(page.text("pure_pursuit-kx-value")), 0.1)
+    assert 2.0 < found.controller.gains[0] < 3.0
     assert found.controller.look_ahead == 0.49
     assert page.text("problem") == ""
     choose(page, "law", "kanayama")
@@ -376,6 +403,7 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
 
     from agv_analysis.stability.margins import margins
 
+    @functools.cache
     def expected(kx: float) -> dict[str, str]:
         changed = dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=kx))
         return dict(margins(changed).rows())
@@ -385,7 +413,7 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
         rows = page.chrome.execute_script(f"return [...document.querySelectorAll('#lap tr')].map(row => {cells})")
         return dict(rows)
 
-    before, after = expected(25.0), expected(28.0)
+    before = expected(25.0)
 
     def is_old() -> bool:
         return bool(page.chrome.find_element("id", "lap").get_attribute("class"))
@@ -393,7 +421,8 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
     page.until(lambda: before.items() <= shown().items() and not is_old())
     page.slider("kx").send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)  # three moves, the last counts
     page.until(is_old)
-    page.until(lambda: after.items() <= shown().items() and not is_old())
+    page.until(lambda: not is_old() and expected(float(page.text("kx-value"))).items() <= shown().items())
+    assert float(page.text("kx-value")) > 26.0
     assert complaints(page) == []
 
 
@@ -422,14 +451,98 @@ def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     page.until(lambda: "pinned" in page.names("track"))
     page.click("preset-predicted")
     page.until(lambda: "predicted: with an exact model" in page.text("summary"))
-    errors = page.text("summary").splitlines()[0]
+    head, errors = page.text("summary").splitlines()[:2]
+    assert head.split() == ["now", "pinned"]
     now, _, pinned = errors.removeprefix("Error in the last tenth at most ").partition(" m ")
     assert float(now) < 1e-6
     assert pinned == "diverges" or float(pinned.removeprefix("at most ").removesuffix(" m")) > 1e3
     assert page.names("time").count("pinned") == 3
+    script = """return [...document.querySelector('#plot-time .js-plotly-plot').data]
+        .map(trace => [trace.name, trace.line?.dash])"""
+    assert {dash for name, dash in page.chrome.execute_script(script) if name == "pinned"} == {"dot"}
+    assert page.text("pinned-name") == "Pinned, dotted: policy hold (now predict)"
     page.click("unpin")
     page.until(lambda: "pinned" not in page.names("time"))
     assert complaints(page) == []
+
+
+def test_the_badge_says_word_deviation_and_confidence_and_nothing_moves(page: Page, base: Scenario) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    def top() -> float:
+        script = "return document.getElementById('plot-track').getBoundingClientRect().top + scrollY"
+        return float(page.chrome.execute_script(script))
+
+    analysis = analyse(simulate(base))
+    page.until(lambda: page.text("badge-word") == analysis.verdict.word)
+    assert page.text("badge-deviation") == f"{analysis.deviation.largest:.3g} m"
+    assert analysis.evidence.confidence is not None
+    assert page.text("badge-sure") == confidence_text(analysis.evidence.confidence)
+    before = top()
+    page.click("preset-missed")
+    page.until(lambda: page.text("badge-deviation") == "diverges")
+    page.until(lambda: page.text("badge-word") == "unstable")
+    assert top() == before
+    page.click("pin")
+    page.chrome.find_element("id", "more").send_keys("\nplant.color=red")
+    page.until(lambda: "color" in page.text("problem"))
+    assert top() == before
+    # the text of a preset is there as long as its setting is
+    page.click("preset-paper")
+    page.until(lambda: "closes the 5 m" in page.text("story"))
+    page.slider("ky").send_keys(Keys.ARROW_RIGHT)
+    page.until(lambda: page.text("story") == "")
+
+
+def test_what_a_channel_does_not_use_is_greyed(page: Page) -> None:
+    def off() -> list[str]:
+        return [key for key in ("p", "r", "n") if page.slider(key).get_attribute("data-disabled") is not None]
+
+    assert off() == ["n"]  # gilbert_elliott
+    expected = {"perfect": ["p", "r", "n"], "bernoulli": ["r", "n"], "burst": ["p", "r"]}
+    for model in expected:
+        choose(page, "model", model)
+        page.until(functools.partial(lambda name: off() == expected[name], model))
+    assert "the chosen channel does not use it" in page.chrome.execute_script(
+        "return getComputedStyle(document.querySelector('#of-r label'), '::after').content"
+    )
+
+
+def test_the_address_holds_the_setting(page: Page, address: str) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    assert "#" not in page.chrome.current_url
+    page.slider("kx").send_keys(Keys.PAGE_UP)
+    choose(page, "track", "line")
+    page.until(lambda: "track=" in page.chrome.current_url and "kx=" in page.chrome.current_url)
+    kx, url, summary = page.text("kx-value"), page.chrome.current_url, page.text("summary")
+    page.chrome.get("about:blank")
+    page.chrome.get(url)
+    page.until(lambda: page.text("kx-value") == kx and page.text("summary") == summary)
+    assert page.chrome.current_url == url
+    page.chrome.get("about:blank")
+    page.chrome.get(f"{address}#kx=%22much%22&nonsense=1&track=%22moon%22&ts=1e9&%")
+    page.until(lambda: page.text("kx-value") == "25" and "50 ms" in page.text("summary") + page.text("badge-outage"))
+    assert page.text("problem") == ""
+
+
+def test_on_a_phone_results_come_first_and_controls_are_in_a_drawer(page: Page) -> None:
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    try:
+        page.chrome.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        page.chrome.refresh()
+        page.until(lambda: page.text("badge-deviation").endswith(" m"))
+        page.until(lambda: not page.chrome.find_element("id", "controls").is_displayed())
+        for name in ("badge", "plot-track"):
+            rect = page.chrome.execute_script(f"return document.getElementById('{name}').getBoundingClientRect()")
+            assert 0.0 <= rect["top"] < rect["bottom"] <= 844, name
+        page.chrome.find_element("css selector", "#drawer summary").click()
+        page.until(lambda: page.chrome.find_element("id", "controls").is_displayed())
+        rect = page.chrome.execute_script("return document.getElementById('drawer').getBoundingClientRect()")
+        assert rect["top"] > 300  # badge and track are seen beside it
+        assert page.chrome.execute_script("return document.documentElement.scrollWidth") <= 390
+    finally:
+        page.chrome.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def test_a_bad_setting_says_why_and_a_good_one_takes_it_back(page: Page) -> None:
@@ -448,13 +561,16 @@ def test_what_is_exported_is_what_is_shown(page: Page, base: Scenario) -> None:
     from selenium.webdriver.common.keys import Keys
 
     page.slider("kx").send_keys(Keys.ARROW_RIGHT)
-    page.until(lambda: page.slider("kx").get_attribute("aria-valuenow") == "26")
+    page.until(lambda: page.text("kx-value") != "25")
+    kx = float(page.text("kx-value"))
+    assert 25.0 < kx < 26.5
     page.click("export")
     page.until(lambda: "explored.yaml" in page.text("exported"))
+    assert "your browser's downloads" in page.text("export-said")
     command, _, text = page.text("exported").partition("\n\n")
     assert command == "agv-ncs simulate explored.yaml --report explored.html"
     found = parse_scenario(text, "exported")
-    assert found == dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=26.0))
+    assert found == dataclasses.replace(base, controller=dataclasses.replace(base.controller, kx=kx))
 
 
 def test_it_is_dark_where_all_else_is(page: Page) -> None:
