@@ -13,7 +13,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test coverage bench fuzz torture dist lowest pythons docs sample clean
+.PHONY: demo test coverage bench fuzz torture dist lowest pythons docs images sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -49,6 +49,9 @@ pythons: $(VENV)/test.stamp ## the cheap tests with each version of Python that 
 
 docs: $(VENV)/run.stamp ## bring README.md and docs/ up to date with the code
 	$(BIN)/python docs/update.py
+
+images: $(VENV)/test.stamp ## draw the pages in headless Chromium to docs/images
+	$(BIN)/python docs/screenshots.py
 
 sample: $(VENV)/run.stamp ## make the sample bag anew
 	rm -rf bags/sample

@@ -94,6 +94,18 @@ def test_the_answer_in_metres_of_the_readme_is_true() -> None:
     assert (deviation <= 0.60).mean() == pytest.approx(19 / 20, abs=0.03)
 
 
+def test_each_page_is_drawn_at_the_size_of_a_screen_and_of_a_phone_light_and_dark() -> None:
+    """`make images` draws them; here they are there, of the size that their names say, and shown by the docs."""
+    pages = "".join(page.read_text() for page in (REPOSITORY / "docs").glob("*.md"))
+    for name in ("report", "sweep", "map", "explorer"):
+        for size in ("1400x900", "390x844"):
+            for scheme in ("light", "dark"):
+                content = (REPOSITORY / f"docs/images/{name}-{size}-{scheme}.png").read_bytes()
+                assert content.startswith(b"\x89PNG")
+                assert size == f"{int.from_bytes(content[16:20], 'big')}x{int.from_bytes(content[20:24], 'big')}"
+        assert f"images/{name}-1400x900-light.png" in pages or name == "map"
+
+
 def test_the_page_of_the_report_has_every_key_of_the_json() -> None:
     import agv_ncs
 

@@ -1,5 +1,10 @@
 """What if? A page on this machine on which settings are changed and the lap is simulated again at every change.
 
-`settings` turns what is on the page into a scenario, `respond` a scenario into figures and numbers, `layout` is what is
-on the page, `positions` is between sliders and values, `app` answers.
+settings             what is on the page as a scenario
+sliders, positions   what can be moved, and which value a position is
+response             the lap of a scenario as figures and numbers, at once
+background_criteria  what takes longer
+layout               what is where
+app                  the page, and its answers
+guard                who may ask
 """
