@@ -21,7 +21,7 @@ EXTRAS = {
     "parquet": ["pyarrow>=12.0"],
     # Captures of packets as measured links.
     "captures": ["dpkt>=1.9"],
-    # irtt's JSON at several times the speed.
+    # irtt's JSON at several times the speed, where it is short or not written as irtt writes it.
     "irtt": ["msgspec>=0.18"],
 }
 ALL = sorted({package for packages in EXTRAS.values() for package in packages})

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.link.large_arrays import release
 from agv_analysis.link.reception_intervals import Outcomes, Steps, reception_intervals
 from agv_analysis.run import Floats
 
@@ -125,6 +126,7 @@ def _transitions_within(k: Steps, lost: Outcomes, edges: Steps, together: int) -
         some = edges[first : first + together + 1]
         part = slice(some[0], some[-1] + 1)
         found.append(np.diff(_transitions_before(k[part], lost[part])[:, some - some[0]], axis=1))
+        release(k, lost)
     return np.concatenate(found, axis=1)
 
 

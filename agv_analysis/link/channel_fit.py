@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agv_analysis.link.goodness_of_fit import Goodness, goodness_of_fit
+from agv_analysis.link.large_arrays import count_of
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.resampling import age_and_loss_samples
@@ -99,7 +100,7 @@ def fit_channel(lost: Outcomes, k: Steps | None = None) -> ChannelFit:
     k = np.arange(len(lost)) if k is None else k
     found, goodness = count_transitions(k, lost), goodness_of_fit(k, lost)
     ages, rates = age_and_loss_samples(k, lost) if not goodness.fits else (None, None)
-    share = float(np.mean(lost))
+    share = count_of(lost, lambda part: part) / len(lost)
     return ChannelFit(
         loss_rate=Estimate.about(share, *(interval_of(found, loss_rate) if rates is None else _quantiles(rates))),
         mean_age=Estimate.about(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,22 +13,19 @@ from numpy.typing import NDArray
 
 from agv_analysis.link.change_points import Stationarity, stationarity
 from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
+from agv_analysis.link.large_arrays import column_of, count_of, order_statistics, parts, taken
 from agv_analysis.link.markov_channel import chain_of
-from agv_analysis.link.measurement import LossRates, Measurement, PacketOutcomes, Setting
-from agv_analysis.link.reception_intervals import Outcomes, Steps
+from agv_analysis.link.measurement import LOST, LossRates, Measurement, PacketOutcomes, Setting
+from agv_analysis.link.reception_intervals import Outcomes, Steps, series_of
 from agv_analysis.link.resampling import weights
 from agv_analysis.metrics.confidence import CONFIDENCE
-from agv_analysis.metrics.outages import ages, outage_begins, outage_lengths
+from agv_analysis.metrics.outages import ages
 from agv_analysis.run import Floats
 from agv_ros.parameters import as_dict
 
 PERCENTILES = (50, 95, 99)
 
 UPLINK, DOWNLINK, ROUND_TRIP = "uplink", "downlink", "round_trip"
-
-
-_PART = 1 << 17
-"""Packets whose ages are worked out together."""
 
 
 def _rank(percent: int, count: int) -> int:
@@ -46,21 +44,20 @@ class Spread:
     count: int
 
     @classmethod
-    def of(cls, values: Floats) -> Spread | None:
-        """Of values, NaN left out; None if nothing is left."""
-        return cls.of_own(values.copy())
+    def of(cls, values: Callable[[], Iterable[Floats]]) -> Spread | None:
+        """Of values, given in parts as often as they are asked for, NaN left out; None if nothing is left."""
 
-    @classmethod
-    def of_own(cls, values: Floats) -> Spread | None:
-        """As `of`, of values that nobody else needs: their order changes, so that no other is needed."""
-        known = ~np.isnan(values)
-        count = int(np.count_nonzero(known))
+        def known() -> Iterator[Floats]:
+            return (part[~np.isnan(part)] for part in values())
+
+        count, total, largest = 0, 0.0, -math.inf
+        for part in known():
+            count, total = count + len(part), total + float(part.sum())
+            largest = max(largest, float(part.max(initial=-math.inf)))
         if not count:
             return None
-        mean = float(np.sum(values, where=known)) / count
-        ranks = [_rank(q, count) for q in PERCENTILES]
-        values.partition([*ranks, count - 1])  # NaN comes last
-        return cls(mean, tuple(values[ranks].tolist()), float(values[count - 1]), count)
+        percentiles = order_statistics(known, [_rank(q, count) for q in PERCENTILES])
+        return cls(total / count, tuple(percentiles), largest, count)
 
     @classmethod
     def of_counts(cls, counts: NDArray[np.int64], unit: float) -> Spread:
@@ -84,31 +81,34 @@ class DirectionFigures:
         self.name, self._interval = name, interval
         self._packets, self._sent = packets, sent
 
-    @property
+    @cached_property
     def k(self) -> Steps:
-        """Numbers of the packets of which the outcome is known, shape (n,); made anew, since there may be many."""
-        return np.flatnonzero(self._packets.known)
+        """Numbers of the packets of which the outcome is known, shape (n,)."""
+        outcome = self._packets.outcome
+        known = (part.start + np.flatnonzero(outcome[part] <= LOST) for part in parts(len(outcome), outcome))
+        return column_of(known, np.int64)
 
-    @property
+    @cached_property
     def lost(self) -> Outcomes:
         """Which of these were lost, shape (n,)."""
-        known = self._packets.known
-        return self._packets.lost if known.all() else self._packets.lost[known]
+        outcome = self._packets.outcome
+        known = (outcome[part][outcome[part] <= LOST] == LOST for part in parts(len(outcome), outcome))
+        return column_of(known, np.bool_)
 
     @cached_property
     def count(self) -> int:
         """Packets of which the outcome is known."""
-        return int(np.count_nonzero(self._packets.known))
+        return count_of(self._packets.outcome, lambda part: part <= LOST)
 
-    @property
+    @cached_property
     def is_told(self) -> bool:
         """Is it known of every packet that was sent this way what became of it?"""
         return self._packets.is_told
 
-    @property
+    @cached_property
     def count_lost(self) -> int:
         """Packets that were lost for certain."""
-        return int(np.count_nonzero(self._packets.lost))
+        return count_of(self._packets.outcome, lambda part: part == LOST)
 
     @cached_property
     def fit(self) -> ChannelFit:
@@ -134,13 +134,12 @@ class DirectionFigures:
 
         One that is open at the end lasts at least to the end of its last packet's interval.
         """
-        k, lost = self.k, self.lost
-        begins = outage_begins(k, lost)
-        ends = begins + outage_lengths(k, lost)
-        closed = np.where(
-            ends < len(k), self._sent[k[np.minimum(ends, len(k) - 1)]], self._sent[k[-1]] + self._interval
-        )
-        return np.asarray(closed - self._sent[k[begins]])
+        k = self.k
+        begins, lengths, is_lost = series_of(k, self.lost)
+        begins, ends = begins[is_lost], (begins + lengths)[is_lost]
+        closed, begun = (taken(self._sent, taken(k, np.minimum(at, len(k) - 1))) for at in (ends, begins))
+        closed[ends == len(k)] = self._sent[k[-1]] + self._interval
+        return np.asarray(closed - begun)
 
     @property
     def longest(self) -> float:
@@ -154,8 +153,7 @@ class DirectionFigures:
             return None
         k, lost = self.k, self.lost
         counts, newest = np.zeros(0, dtype=np.int64), k[:1]
-        for first in range(0, len(k), _PART):
-            part = slice(first, first + _PART)
+        for part in parts(len(k), k, lost):
             found = ages(np.append(newest, k[part]), np.append(False, lost[part]))[1:]
             newest = k[part][-1:] - found[-1:]
             more = np.bincount(found, minlength=len(counts))
@@ -166,7 +164,8 @@ class DirectionFigures:
     @cached_property
     def delay(self) -> Spread | None:
         """Time under way [s] of what was received; None if it is not known."""
-        return None if self._packets.delay is None else Spread.of(self._packets.delay)
+        delay = self._packets.delay
+        return None if delay is None else Spread.of(lambda: (delay[part] for part in parts(len(delay), delay)))
 
     @cached_property
     def jitter(self) -> Spread | None:
@@ -174,8 +173,11 @@ class DirectionFigures:
         delay = self._packets.delay
         if delay is None:
             return None
-        steps = np.diff(delay)
-        return Spread.of_own(np.abs(steps, out=steps))
+
+        def steps() -> Iterator[Floats]:
+            return (np.abs(np.diff(delay[part.start : part.stop + 1])) for part in parts(len(delay) - 1, delay))
+
+        return Spread.of(steps)
 
     def to_json(self) -> dict[str, Any]:
         """The figures by name; `loss_rate` is null where the file cannot tell."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from agv_analysis.link.large_arrays import is_all_nan, parts, sizes_and_counts, taken
 from agv_analysis.link.link_figures import LinkFigures
+from agv_analysis.link.measurement import LOST as LOST_PACKET
 from agv_analysis.output_file import output_file
+from agv_analysis.run import Floats
 from agv_ros.errors import UserError
 
 _MOST_POINTS = 20_000
@@ -25,11 +29,15 @@ def draw_link(path: Path, found: LinkFigures) -> None:
     grid = figure.add_gridspec(2, 2)
     course, outages, delays = (figure.add_subplot(place) for place in (grid[0, :], grid[1, 0], grid[1, 1]))
     packets = measured.whole
-    step = max(1, measured.packets // _MOST_POINTS)
+    shown = np.arange(0, measured.packets, max(1, measured.packets // _MOST_POINTS))
     if packets.delay is not None:
-        course.plot(measured.sent[::step], 1e3 * packets.delay[::step], ".", ms=1.5, color=COLOURS[DRIVEN])
-    lost = measured.sent[packets.lost]
-    marks = lost[:: max(1, len(lost) // _MOST_POINTS)]
+        times, shown_delays = taken(measured.sent, shown), taken(packets.delay, shown)
+        course.plot(times, 1e3 * shown_delays, ".", ms=1.5, color=COLOURS[DRIVEN])
+    outcome = packets.outcome
+    lost = np.concatenate(
+        [part.start + np.flatnonzero(outcome[part] == LOST_PACKET) for part in parts(len(outcome), outcome)]
+    )
+    marks = taken(measured.sent, lost[:: max(1, len(lost) // _MOST_POINTS)])
     course.plot(
         marks, np.zeros(len(marks)), "|", color=COLOURS[LOST], ms=10.0, transform=course.get_xaxis_transform(),
         clip_on=False, label=f"lost ({len(lost)})",
@@ -47,11 +55,8 @@ def draw_link(path: Path, found: LinkFigures) -> None:
     outages.set(xlabel="length [ms]", ylabel="outages at least as long", title="Outages")
     for direction in found.directions.values():
         values = getattr(measured, direction.name).delay
-        if values is not None and not np.isnan(values).all():
-            known = np.sort(values[~np.isnan(values)])
-            beyond = 1.0 - np.arange(len(known)) / len(known)
-            thin = np.unique(np.concatenate((np.arange(0, len(known), max(1, len(known) // 2000)), [len(known) - 1])))
-            delays.plot(1e3 * known[thin], beyond[thin], label=direction.name.replace("_", " "))
+        if values is not None and not is_all_nan(values):
+            delays.plot(*_beyond(values), label=direction.name.replace("_", " "))
     if delays.lines:
         delays.set(yscale="log")
         delays.legend(loc="upper right", fontsize="small")
@@ -60,3 +65,15 @@ def draw_link(path: Path, found: LinkFigures) -> None:
         figure.savefig(output_file(path), dpi=130)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn to: {error}") from None
+
+
+def _beyond(delay: Floats) -> tuple[Floats, Floats]:
+    """Delays [ms], increasing, and the share of the packets that came at least as late; NaN is left out."""
+
+    def known() -> Iterator[Floats]:
+        for part in parts(len(delay), delay):
+            yield np.maximum(delay[part][~np.isnan(delay[part])], 0.0)
+
+    sizes, counts = sizes_and_counts(known)
+    upto = np.cumsum(counts)
+    return 1e3 * sizes, 1.0 - (upto - counts) / upto[-1]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from agv_analysis.link.large_arrays import all_of, column_of, count_of, is_all_nan, parts, release
 from agv_analysis.link.measurement import LOST, RECEIVED, Measurement, PacketOutcomes
 from agv_analysis.output_file import output_file
 from agv_analysis.run import Floats
@@ -65,9 +67,9 @@ def link_of_loop(measured: Measurement, rtt: str = UP) -> LinkOfLoop:
         notes.append(f"only the round trip is known: {said} (--rtt {rtt})")
     found, early = [], 0
     for delay in delays:
-        below = 0 if delay is None else int(np.count_nonzero(delay < 0.0))
+        below = 0 if delay is None else count_of(delay, lambda part: part < 0.0)
         early += below
-        found.append(np.maximum(delay, 0.0) if below and delay is not None else delay)
+        found.append(_mapped(delay, lambda part: np.maximum(part, 0.0)) if below and delay is not None else delay)
     if early:
         notes.append(f"{early} delays are below 0, since the clocks do not agree: they count as 0")
     nothing = np.zeros(measured.packets, dtype=np.bool_)
@@ -77,7 +79,12 @@ def link_of_loop(measured: Measurement, rtt: str = UP) -> LinkOfLoop:
 
 
 def _delay(packets: PacketOutcomes | None) -> Floats | None:
-    return None if packets is None or packets.delay is None or np.isnan(packets.delay).all() else packets.delay
+    return None if packets is None or packets.delay is None or is_all_nan(packets.delay) else packets.delay
+
+
+def _mapped(values: Floats, function: Callable[[Floats], Floats]) -> Floats:
+    """A function of each value of a large array, shape (N,)."""
+    return column_of((function(values[part]) for part in parts(len(values), values)), np.float64)
 
 
 def _shares(both: PacketOutcomes, rtt: str) -> tuple[tuple[Floats | None, Floats | None], str]:
@@ -85,16 +92,17 @@ def _shares(both: PacketOutcomes, rtt: str) -> tuple[tuple[Floats | None, Floats
     delay = _delay(both)
     if delay is None:
         return (None, None), "its delay is not known"
-    nothing = np.where(np.isnan(delay), np.nan, 0.0)
     if rtt == HALF:
-        return (0.5 * delay, 0.5 * delay), "and each way takes half its time"
+        half = _mapped(delay, lambda part: 0.5 * part)
+        return (half, half), "and each way takes half its time"
+    nothing = _mapped(delay, lambda part: np.where(np.isnan(part), np.nan, 0.0))
     return ((delay, nothing), "and all its time") if rtt == UP else ((nothing, delay), "and all its time")
 
 
 def _held(packets: PacketOutcomes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Lost or not, shape (N,); where that is not known, what it was before, received at the beginning."""
     known = packets.known
-    if known.all():
+    if all_of(known, lambda part: part):
         return packets.lost
     last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
     outcome = np.where(last >= 0, packets.outcome[np.maximum(last, 0)], RECEIVED)
@@ -103,11 +111,22 @@ def _held(packets: PacketOutcomes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 def _increasing(sent: Floats) -> Floats:
     """Times [s] that increase by a microsecond at least: stamps may be coarser than packets are apart."""
-    steps = np.diff(sent)
-    if not np.any(steps < 1e-6):
-        return sent if sent[0] == 0.0 else sent - sent[0]
-    np.maximum(steps, 1e-6, out=steps)
-    return np.concatenate(([0.0], np.cumsum(steps, out=steps)))
+
+    def steps() -> Iterator[Floats]:
+        return (np.diff(sent[part.start : part.stop + 1]) for part in parts(len(sent) - 1, sent))
+
+    if not any(np.any(part < 1e-6) for part in steps()):
+        return sent if sent[0] == 0.0 else _mapped(sent, lambda part: part - sent[0])
+
+    def times() -> Iterator[Floats]:
+        newest = np.zeros(1)
+        yield newest
+        for part in steps():
+            found = np.cumsum(np.append(newest, np.maximum(part, 1e-6)))[1:]
+            newest = found[-1:]
+            yield found
+
+    return column_of(times(), np.float64)
 
 
 def of_trace(file: str, link: str, ts: float) -> Measurement:
@@ -141,6 +160,7 @@ def write_trace(path: Path, link: LinkOfLoop) -> None:
             for first in range(0, len(link.time), _ROWS):
                 rows = _rows(link, slice(first, first + _ROWS), [name for name, _ in columns])
                 file.write("\n".join([form % tuple(row) for row in rows.tolist()]) + "\n")
+                release(*(getattr(link, name) for name, _ in columns))
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror}") from None
 

@@ -6,11 +6,13 @@ packets were lost in each interval, and no more; a `Setting` is no measurement b
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.link.large_arrays import column_of, count_of, order_statistics, parts
 from agv_analysis.run import Floats
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
@@ -65,17 +67,18 @@ class PacketOutcomes:
     @property
     def known(self) -> NDArray[np.bool_]:
         """Of which packets is the outcome known? Shape (N,)."""
-        return np.asarray(self.outcome <= LOST)
+        return column_of((self.outcome[part] <= LOST for part in parts(len(self.outcome), self.outcome)), np.bool_)
 
     @property
     def lost(self) -> NDArray[np.bool_]:
         """Which packets were lost for certain? Shape (N,)."""
-        return np.asarray(self.outcome == LOST)
+        return column_of((self.outcome[part] == LOST for part in parts(len(self.outcome), self.outcome)), np.bool_)
 
     @property
     def is_told(self) -> bool:
         """Does the file say what became of every packet that was sent in this direction, and was one sent?"""
-        return bool(self.known.any()) and not bool((self.outcome == UNKNOWN).any())
+        is_silent = count_of(self.outcome, lambda part: part == UNKNOWN) > 0
+        return not is_silent and count_of(self.outcome, lambda part: part <= LOST) > 0
 
 
 @dataclass(frozen=True)
@@ -114,8 +117,12 @@ class Measurement:
         """Median time between packets sent [s]; 0 for a single one."""
         if self.packets < 2:
             return 0.0
-        steps = np.diff(self.sent)
-        return float(np.median(steps, overwrite_input=True))
+        sent, count = self.sent, self.packets - 1
+
+        def steps() -> Iterator[Floats]:
+            return (np.diff(sent[part.start : part.stop + 1]) for part in parts(count, sent))
+
+        return sum(order_statistics(steps, [(count - 1) // 2, count // 2])) / 2.0
 
     @property
     def whole(self) -> PacketOutcomes:
@@ -163,6 +170,12 @@ class Setting:
 
 
 Reading = Measurement | LossRates | Setting
+
+
+def of_one_way(outcome: Codes) -> Codes:
+    """Outcomes of either way from those of round trips, shape (N,): of what was lost it is not known on which."""
+    told = (np.where(outcome[part] == RECEIVED, RECEIVED, UNKNOWN) for part in parts(len(outcome), outcome))
+    return column_of(told, np.int8)
 
 
 def needs_packets(count: int, source: str, what: str, malformed: Malformed | None = None) -> None:

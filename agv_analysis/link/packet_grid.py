@@ -7,11 +7,12 @@ memory that what it says takes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
+from agv_analysis.link.large_arrays import PART, Column, column_of, parts, release
 from agv_analysis.link.measurement import LOST, RECEIVED, Codes, MeasurementError
 from agv_analysis.run import Floats
 
@@ -19,38 +20,6 @@ Ints = NDArray[np.int64]
 
 _SPARSE, _MOST_MISSING = 1000, 1_000_000
 """A series of numbered packets may lack so many for each that is there, and so many more."""
-
-_LEAST, _MORE = 4096, 8
-"""Values that a column has room for, and the share of them by which it grows."""
-
-
-class Column:
-    """Values that come in parts, and are never there twice."""
-
-    def __init__(self, dtype: DTypeLike = np.float64) -> None:
-        self._values: NDArray[Any] = np.zeros(0, dtype=dtype)
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def extend(self, values: NDArray[Any]) -> None:
-        """Put values at the end."""
-        begin = self._count
-        self.reach(begin + len(values))
-        self._values[begin : self._count] = values
-
-    def reach(self, count: int) -> None:
-        """Have so many values at least, further ones being 0."""
-        if count > len(self._values):
-            room = max(count, _LEAST, len(self._values) + len(self._values) // _MORE)
-            self._values.resize(room, refcheck=False)  # in place, where the system can
-        self._count = max(self._count, count)
-
-    @property
-    def values(self) -> NDArray[Any]:
-        """Those so far, shape (n,): not a copy, and to be asked for again when more have come."""
-        return self._values[: self._count]
 
 
 class Grid(NamedTuple):
@@ -108,7 +77,8 @@ class PacketGrid:
         if sent is not None and self._sent is None:
             self._sent = Column()
             self._sent.reach(len(self._received))
-            self._sent.values[:] = np.nan
+            for part in parts(len(self._received), self._sent.values):
+                self._sent.values[part] = np.nan
         rows = self._rows(seq)
         fresh = np.flatnonzero(~self._received.values[rows])
         if np.any(np.diff(rows) <= 0):  # twice in this very part, or out of order
@@ -125,6 +95,7 @@ class PacketGrid:
             stamps = np.full(len(rows), np.nan) if sent is None else sent[fresh]
             self._sent.values[rows] = stamps
             self.dated += int(np.count_nonzero(~np.isnan(stamps)))
+        release(*(column.values for column in self._columns))
 
     def whole(self, interval: float, first: int | None = None, last: int | None = None) -> Grid:
         """All packets from number `first` to number `last`, by default those mentioned; without a record they are lost.
@@ -141,18 +112,19 @@ class PacketGrid:
         for column in self._columns:
             column.reach(rows.stop)
         received = self._received.values[rows]
-        delays = tuple(column.values[rows] for column in self._delays)
-        for delay in delays:
-            np.copyto(delay, np.nan, where=~received)
-        if self._sent is None or self.dated < 2:
-            sent = np.arange(len(received), dtype=np.float64)
-            sent *= interval
-        else:
-            sent = self._sent.values[rows]
-            np.copyto(sent, np.nan, where=~received)
+        count, delays = len(received), tuple(column.values[rows] for column in self._delays)
+        is_dated = self._sent is not None and self.dated >= 2
+        dated = (self._sent.values[rows],) if self._sent is not None and is_dated else ()
+        for column in (*delays, *dated):
+            for part in parts(count, column, received):
+                np.copyto(column[part], np.nan, where=~received[part])
+        if dated:
+            (sent,) = dated
             interpolate(sent)
-        outcome = np.where(received, np.int8(RECEIVED), np.int8(LOST))
-        return Grid(sent, outcome, delays, self.duplicates, self.reordered)
+        else:
+            sent = column_of((interval * np.arange(part.start, part.stop) for part in parts(count)), np.float64)
+        outcomes = (np.where(received[part], RECEIVED, LOST) for part in parts(count, received))
+        return Grid(sent, column_of(outcomes, np.int8), delays, self.duplicates, self.reordered)
 
     @property
     def _columns(self) -> tuple[Column, ...]:
@@ -169,8 +141,12 @@ class PacketGrid:
         for column in self._columns:
             count = len(column)
             column.reach(count + more)
-            column.values[more:] = column.values[:count]  # numpy minds the overlap
-            column.values[:more] = 0
+            values = column.values
+            for part in reversed(list(parts(count))):
+                values[part.start + more : part.stop + more] = values[part]  # numpy minds the overlap
+                release(values)
+            for part in parts(more, values):
+                values[part] = 0
 
 
 def _check(first: int, last: int, records: int) -> None:
@@ -186,22 +162,44 @@ def interpolate(times: Floats) -> None:
 
     Before the first that is known, and behind the last, packets are as far apart as on average.
     """
-    unknown = np.isnan(times)
-    begin, end = int(np.argmin(unknown)), len(times) - 1 - int(np.argmin(unknown[::-1]))
-    step = (times[end] - times[begin]) / (end - begin)
-    times[:begin] = times[begin] + step * np.arange(-begin, 0)
-    times[end + 1 :] = times[end] + step * np.arange(1, len(times) - end)
-    unknown[:begin] = unknown[end + 1 :] = False
-    gaps = np.flatnonzero(unknown)
-    if len(gaps):
-        edges = np.flatnonzero(np.diff(gaps) > 1)
-        begins, ends = gaps[np.append(0, edges + 1)] - 1, gaps[np.append(edges, len(gaps) - 1)] + 1
-        lengths = ends - begins - 1
-        slope = np.repeat((times[ends] - times[begins]) / (ends - begins), lengths)
-        times[gaps] = np.repeat(times[begins], lengths) + slope * (gaps - np.repeat(begins, lengths))
-    times -= times[0]
-    # Time stamps are rounded, and a reply that is printed late dates its packet late: order is that of the numbers.
-    np.maximum.accumulate(times, out=times)
+    begin, end = next_known(times, 0), len(times) - 1 - next_known(times[::-1], 0)
+    step, first, last = (times[end] - times[begin]) / (end - begin), times[begin], times[end]
+    for part in parts(begin, times):
+        times[part] = first + step * np.arange(part.start - begin, part.stop - begin)
+    for part in parts(len(times) - end - 1, times):
+        times[end + 1 + part.start : end + 1 + part.stop] = last + step * np.arange(part.start + 1, part.stop + 1)
+    while begin < end:
+        until = next_known(times, min(begin + PART, end))
+        between = times[begin : until + 1]
+        unknown = np.isnan(between)
+        if unknown.any():
+            at, known = np.flatnonzero(unknown), np.flatnonzero(~unknown)
+            between[at] = np.interp(at, known, between[known])
+        begin = until
+        release(times)
+    count_on(times)
+
+
+def count_on(times: Floats) -> None:
+    """In place: times [s] since the first, none before the one before it.
+
+    Time stamps are rounded, and a reply that is printed late dates its packet late: order is that of the numbers.
+    """
+    newest, origin = -np.inf, times[0]
+    for part in parts(len(times), times):
+        times[part] -= origin
+        times[part.start] = max(times[part.start], newest)
+        np.maximum.accumulate(times[part], out=times[part])
+        newest = times[part.stop - 1]
+
+
+def next_known(times: Floats, first: int) -> int:
+    """The first place from `first` on that has a number; there must be one."""
+    for part in parts(len(times) - first, times):
+        known = np.flatnonzero(~np.isnan(times[first + part.start : first + part.stop]))
+        if len(known):
+            return int(first + part.start + known[0])
+    raise ValueError("no time is known")
 
 
 class CountedOn:

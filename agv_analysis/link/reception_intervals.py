@@ -7,12 +7,14 @@ is a censored observation, kept apart from the complete ones.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.link.large_arrays import column_of, parts, taken
 from agv_analysis.metrics.outages import is_unbroken
 
 Steps = NDArray[np.int64]
@@ -39,12 +41,15 @@ class Intervals:
     @cached_property
     def between_receptions(self) -> Steps:
         """L, complete, shape (n,)."""
-        received = np.flatnonzero(~self.lost)
-        between = np.diff(received)
-        if is_unbroken(self.k):
-            return between
-        series = np.searchsorted(np.flatnonzero(np.diff(self.k) != 1), received)
-        return np.asarray(between[np.diff(series) == 0])
+        return column_of(self._between_receptions(), np.int64)
+
+    def _between_receptions(self) -> Iterator[Steps]:
+        """The same in parts."""
+        last = np.zeros(0, dtype=np.int64)
+        for part in parts(len(self.lost), self.lost, self.k):
+            received = np.concatenate((last, part.start + np.flatnonzero(~self.lost[part])))
+            between, last = np.diff(received), received[-1:]
+            yield between if is_unbroken(self.k) else between[np.diff(self.k[received]) == between]
 
     @property
     def longest(self) -> int:
@@ -52,12 +57,29 @@ class Intervals:
         return max(int(self.outages.max(initial=0)), self.longest_open)
 
 
+def series_of(k: Steps, lost: Outcomes) -> tuple[Steps, Steps, Outcomes]:
+    """Where each series of slots with the same outcome begins, its length, and was it lost? Each of shape (n,)."""
+
+    def begins() -> Iterator[Steps]:
+        yield np.zeros(1, dtype=np.int64)
+        for part in parts(len(lost) - 1, k, lost):
+            here, following = slice(part.start, part.stop), slice(part.start + 1, part.stop + 1)
+            is_other = lost[following] != lost[here]
+            if not is_unbroken(k):
+                is_other |= k[following] - k[here] != 1
+            yield part.start + 1 + np.flatnonzero(is_other)
+
+    found = np.concatenate(list(begins()))
+    return found, np.diff(found, append=len(lost)), taken(lost, found)
+
+
 def reception_intervals(k: Steps, lost: Outcomes) -> Intervals:
     """Intervals of outcomes `lost` of the slots `k`, increasing, both of shape (N,), N >= 1."""
-    breaks = np.zeros(len(k) - 1, dtype=np.bool_) if is_unbroken(k) else np.diff(k) != 1
-    begins = np.append(0, np.flatnonzero(breaks | (lost[1:] != lost[:-1])) + 1)
-    lengths, is_lost = np.diff(begins, append=len(lost)), lost[begins]
-    seen_from = np.append(False, ~breaks[begins[1:] - 1])
+    begins, lengths, is_lost = series_of(k, lost)
+    seen_from = np.ones(len(begins), dtype=np.bool_)
+    if not is_unbroken(k):
+        seen_from = taken(k, begins) - taken(k, np.maximum(begins - 1, 0)) == 1
+    seen_from[0] = False
     whole = seen_from & np.append(seen_from[1:], False)
     return Intervals(
         k,

@@ -9,8 +9,11 @@ Stationary Observations, Ann. Statist. 17, 1989.
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
+from agv_analysis.link.large_arrays import parts, release
 from agv_analysis.link.reception_intervals import Outcomes, Steps, reception_intervals
 from agv_analysis.run import Floats
 
@@ -34,11 +37,25 @@ def age_and_loss_samples(k: Steps, lost: Outcomes) -> tuple[Floats, Floats] | tu
     None where receptions are too few. With intervals L between receptions: E[L (L - 1) / 2] / E[L] and E[L - 1] / E[L].
     """
     L = reception_intervals(k, lost).between_receptions
-    parts = min(_MOST, int(np.sqrt(2 * len(L))))
-    if parts < _FEWEST:
+    count = min(_MOST, int(np.sqrt(2 * len(L))))
+    if count < _FEWEST:
         return None, None
-    ends = np.searchsorted(np.cumsum(L), np.linspace(0.0, float(L.sum()), parts + 1)[1:-1]) + 1
+    upto = 0
+    for part in parts(len(L), L):
+        upto += int(L[part].sum())
+    wanted, ends, upto = np.linspace(0.0, float(upto), count + 1)[1:-1], np.ones(count - 1, dtype=np.int64), 0
+    for part in parts(len(L), L):  # how many of them end before each of the places wanted
+        sums = upto + np.cumsum(L[part])
+        ends += np.searchsorted(sums, wanted)
+        upto = int(sums[-1])
     begins = np.unique(np.append(0, np.minimum(ends, len(L) - 1)))
-    sums = np.stack([np.add.reduceat(values, begins) for values in (L, L * (L - 1) // 2, L - 1)]).astype(np.float64)
-    slots, ages, losses = (weights(len(begins)) @ sums.T).T
+    sums = np.array([_sums(L[first:end]) for first, end in itertools.pairwise([*begins.tolist(), len(L)])])
+    slots, ages, losses = (weights(len(begins)) @ sums).T
     return ages / slots, losses / slots
+
+
+def _sums(L: Steps) -> list[float]:
+    """Of intervals: slots, ages of all slots, losses."""
+    found = [float(values.sum()) for values in (L, L * (L - 1) // 2, L - 1)]
+    release(L)
+    return found

@@ -20,6 +20,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from agv_analysis.link.large_arrays import parts
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.metrics.outages import is_unbroken
 from agv_analysis.run import Floats
@@ -101,16 +102,15 @@ def interval_of(transitions: Transitions, figure: Callable[[Floats, Floats], Flo
 
 def count_transitions(k: Steps, lost: Outcomes) -> Transitions:
     """Transitions of the outcomes of slots `k`, increasing, shape (N,)."""
-    before, after = lost[:-1], lost[1:]
-    if not is_unbroken(k):
-        known = np.diff(k) == 1
-        before, after = before[known], after[known]
-    return Transitions(
-        to_lost=int(np.count_nonzero(~before & after)),
-        delivered=int(np.count_nonzero(~before)),
-        to_delivered=int(np.count_nonzero(before & ~after)),
-        missed=int(np.count_nonzero(before)),
-    )
+    counts = np.zeros(4, dtype=np.int64)
+    for part in parts(len(lost) - 1, k, lost):
+        before, after = lost[part], lost[part.start + 1 : part.stop + 1]
+        if not is_unbroken(k):
+            known = np.diff(k[part.start : part.stop + 1]) == 1
+            before, after = before[known], after[known]
+        counts += [np.count_nonzero(of) for of in (~before & after, ~before, before & ~after, before)]
+    to_lost, delivered, to_delivered, missed = counts.tolist()
+    return Transitions(to_lost, delivered, to_delivered, missed)
 
 
 Probability = TypeVar("Probability", float, Floats)

@@ -13,15 +13,17 @@ from __future__ import annotations
 import hashlib
 import socket
 import struct
-from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike, NDArray
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.text_columns import Progress, open_binary
+from agv_analysis.link.large_arrays import Column, parts
 from agv_analysis.link.measurement import (
     LOST,
     RECEIVED,
@@ -31,6 +33,7 @@ from agv_analysis.link.measurement import (
     PacketOutcomes,
 )
 from agv_analysis.link.packet_grid import PacketGrid
+from agv_analysis.run import Floats
 
 _MAGICS = (
     b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a",
@@ -187,25 +190,54 @@ def samples_of(payload: bytes) -> Iterator[tuple[Writer, int]]:
         at += 4 + length
 
 
+class _Buffered:
+    """Numbers that come one by one, kept in a column."""
+
+    def __init__(self, dtype: DTypeLike) -> None:
+        self._column, self._newest = Column(dtype), list[Any]()
+
+    def append(self, value: float) -> None:
+        self._newest.append(value)
+        if len(self._newest) == _TOGETHER:
+            self._write()
+
+    def _write(self) -> None:
+        self._column.extend(np.array(self._newest, dtype=self._column.values.dtype))
+        self._newest.clear()
+
+    def __len__(self) -> int:
+        return len(self._column) + len(self._newest)
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """All so far, shape (n,)."""
+        self._write()
+        return self._column.values
+
+
+_TOGETHER = 4096
+"""Numbers that are put into a column at once."""
+
+
 def _of_one(path: Path, malformed: Malformed, options: Options) -> Measurement:
-    numbers: dict[Writer, list[int]] = defaultdict(list)
-    times: dict[Writer, list[float]] = defaultdict(list)
+    numbers: dict[Writer, _Buffered] = defaultdict(lambda: _Buffered(np.int64))
+    times: dict[Writer, _Buffered] = defaultdict(lambda: _Buffered(np.float64))
     for packet in _packets(path, malformed, options.progress):
         for writer, number in samples_of(packet.payload):
-            numbers[writer].append(number)
-            times[writer].append(packet.time)
-    of_user = {writer: found for writer, found in numbers.items() if writer[1][-1] in _USER_WRITERS}
-    if not of_user:
+            if writer[1][-1] in _USER_WRITERS:
+                numbers[writer].append(number)
+                times[writer].append(packet.time)
+    if not numbers:
         raise MeasurementError(
             f"{path}: has no samples of RTPS, whose numbers would say what was lost: give the capture of the other end "
             "with --received"
         )
-    writer = _chosen(of_user, options.topic, path)
-    seq, arrived = np.array(of_user[writer], dtype=np.int64), np.array(times[writer])
-    packets = PacketGrid()
-    packets.add(seq, (), arrived - arrived[0])
+    writer = _chosen(numbers, options.topic, path)
+    seq, arrived, packets = numbers[writer].values, times[writer].values, PacketGrid()
+    for part in parts(len(seq), seq, arrived):
+        packets.add(seq[part], (), arrived[part] - arrived[0])
     grid = packets.whole(options.interval or 1.0)
-    others = len(of_user) - 1
+    others = len(numbers) - 1
     notes = [
         f"samples of the writer {_name(writer)}"
         + (f", one of {others + 1}: name another with --topic" if others else ""),
@@ -223,7 +255,7 @@ def _name(writer: Writer) -> str:
     return f"{writer[0].hex()}.{writer[1].hex()}"
 
 
-def _chosen(writers: dict[Writer, list[int]], name: str, path: Path) -> Writer:
+def _chosen(writers: Mapping[Writer, _Buffered], name: str, path: Path) -> Writer:
     """The writer of this name, or the one with most samples. Raises MeasurementError."""
     if not name:
         return max(writers, key=lambda writer: len(writers[writer]))
@@ -234,39 +266,62 @@ def _chosen(writers: dict[Writer, list[int]], name: str, path: Path) -> Writer:
     raise MeasurementError(f"{path}: has no samples of the writer {name}; it has those of {known}")
 
 
-Key = tuple[Any, int]
-"""What a packet is known by at both ends, and the how manieth with it."""
+class _Keyed(NamedTuple):
+    """The packets of a capture, in its order."""
+
+    key: NDArray[np.uint64]
+    """What a packet is known by at both ends: a digest of its samples, or of its bytes; shape (n,)."""
+    time: Floats
+    flow: NDArray[np.int64]
+    """Which of the flows it belongs to."""
+    flows: list[Flow]
 
 
-def _keyed(path: Path, malformed: Malformed, progress: Progress | None) -> Iterator[tuple[Flow, Key, float]]:
-    """Flow, key and time of each packet."""
-    seen: Counter[Any] = Counter()
+def _keyed(path: Path, malformed: Malformed, progress: Progress | None) -> _Keyed:
+    key, time, flow = _Buffered(np.uint64), _Buffered(np.float64), _Buffered(np.int64)
+    flows: dict[Flow, int] = {}
     for packet in _packets(path, malformed, progress):
         samples = tuple(samples_of(packet.payload))
-        key = samples or hashlib.blake2b(packet.payload, digest_size=16).digest()
-        seen[key] += 1
-        yield packet.flow, (key, seen[key]), packet.time
+        known_by = repr(samples).encode() if samples else packet.payload
+        key.append(int.from_bytes(hashlib.blake2b(known_by, digest_size=8).digest(), "little"))
+        time.append(packet.time)
+        flow.append(flows.setdefault(packet.flow, len(flows)))
+    return _Keyed(key.values, time.values, flow.values, list(flows))
+
+
+def arrivals(sent: NDArray[np.uint64], arrived: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """For each key sent, shape (n,), the place of its arrival among those that arrived; -1: it did not come.
+
+    Of equal keys the first one sent is the first one that arrived, and so on.
+    """
+    order, order_of_arrived = np.argsort(sent, kind="stable"), np.argsort(arrived, kind="stable")
+    keys, keys_of_arrived = sent[order], arrived[order_of_arrived]
+    which = np.arange(len(keys)) - np.searchsorted(keys, keys)  # the how manieth with its key
+    at = np.searchsorted(keys_of_arrived, keys) + which
+    came = at < len(keys_of_arrived)
+    came[came] = keys_of_arrived[at[came]] == keys[came]
+    found = np.full(len(keys), -1, dtype=np.int64)
+    found[order[came]] = order_of_arrived[at[came]]
+    return found
 
 
 def _of_two(path: Path, other: Path, malformed: Malformed, options: Options) -> Measurement:
-    arrived = {key: time for _, key, time in _keyed(other, malformed, None)}
-    flows: dict[Flow, list[tuple[Key, float]]] = defaultdict(list)
-    for flow, key, time in _keyed(path, malformed, options.progress):
-        flows[flow].append((key, time))
-    matched = {flow: sum(key in arrived for key, _ in found) for flow, found in flows.items()}
-    if not any(matched.values()):
+    at_sender, at_receiver = _keyed(path, malformed, options.progress), _keyed(other, malformed, options.progress)
+    place = arrivals(at_sender.key, at_receiver.key)
+    matched = np.bincount(at_sender.flow[place >= 0], minlength=len(at_sender.flows))
+    if not matched.any():
         raise MeasurementError(f"{path}: no packet of it is in {other}: are they of the same traffic?")
-    flow = max(matched, key=lambda one: matched[one])
-    packets = flows[flow]
-    sent = np.array([time for _, time in packets])
-    got = np.array([arrived.get(key, np.nan) for key, _ in packets])
+    chosen = int(np.argmax(matched))
+    flow, of_flow = at_sender.flows[chosen], np.flatnonzero(at_sender.flow == chosen)
+    sent, place = at_sender.time[of_flow], place[of_flow]
+    got = np.where(place >= 0, at_receiver.time[np.maximum(place, 0)], np.nan)
     order = np.argsort(sent, kind="stable")
     sent, got = sent[order], got[order]
     came = got[~np.isnan(got)]
     codes = np.where(np.isnan(got), LOST, RECEIVED).astype(np.int8)
     notes = (
-        f"the flow from {_address(flow[0], flow[1])} to {_address(flow[2], flow[3])}, {matched[flow]} of "
-        f"{len(packets)} packets matched; it is taken for the uplink, and delays are as good as the two clocks agree",
+        f"the flow from {_address(flow[0], flow[1])} to {_address(flow[2], flow[3])}, {matched[chosen]} of "
+        f"{len(sent)} packets matched; it is taken for the uplink, and delays are as good as the two clocks agree",
     )
     return Measurement(
         source=str(path), format="capture", sent=sent - sent[0], uplink=PacketOutcomes(codes, got - sent),

@@ -35,6 +35,7 @@ from agv_analysis.link.formats.table_header import (
     is_enough,
 )
 from agv_analysis.link.formats.text_columns import Block, Bytes, Places, blocks, head_of
+from agv_analysis.link.large_arrays import Column, all_of, column_of, count_of, forget, parts
 from agv_analysis.link.measurement import (
     LOST,
     NOT_SENT,
@@ -46,7 +47,7 @@ from agv_analysis.link.measurement import (
     PacketOutcomes,
     needs_packets,
 )
-from agv_analysis.link.packet_grid import Column, CountedOn, PacketGrid
+from agv_analysis.link.packet_grid import CountedOn, PacketGrid
 from agv_analysis.run import Floats
 
 _DIRECTIONS = ("uplink_lost", "downlink_lost")
@@ -54,9 +55,6 @@ _ALWAYS_FLAGS = ("lost", *_DIRECTIONS)
 
 _EMPTY = 2
 """Of a flag: no cell says it."""
-
-_PART = 1 << 17
-"""Packets that are looked at together."""
 
 Part = dict[str, NDArray[np.float64]]
 """Columns of a block by role, of the rows that were understood; NaN where a cell is empty."""
@@ -156,7 +154,7 @@ def _measurement(source: str, values: dict[str, NDArray[Any]], rows: _Rows, opti
     notes = rows.notes
     sent, said = _times(values, options)
     notes += [said] if said else []
-    if np.any(sent[1:] < sent[:-1]):
+    if any(np.any(sent[part.start + 1 : part.stop + 1] < sent[part]) for part in parts(len(sent) - 1, sent)):
         order = np.argsort(sent, kind="stable")
         values, sent = {role: column[order] for role, column in values.items()}, sent[order]
     up, down, whole = _outcomes(values, sent)
@@ -164,7 +162,9 @@ def _measurement(source: str, values: dict[str, NDArray[Any]], rows: _Rows, opti
     if up is not None and down is None and whole is None:
         notes.append("one direction was measured, and is taken for the uplink")
     reordered = _overtaken(values, sent)
-    sent -= sent[0]
+    origin = sent[0]
+    for part in parts(len(sent), sent):
+        sent[part] -= origin
     return Measurement(
         source=source, format="table", sent=sent, uplink=up, downlink=down, round_trip=whole,
         reordered=reordered, malformed=rows.malformed, notes=tuple(notes),
@@ -176,9 +176,9 @@ def _times(values: dict[str, NDArray[Any]], options: Options) -> tuple[Floats, s
     for role in ("sent", "time"):
         if role not in values:
             continue
-        unknown = np.isnan(values[role])
-        if not unknown.any():
+        if not count_of(values[role], np.isnan):
             return values.pop(role), ""
+        unknown = np.isnan(values[role])
         if not unknown.all():
             k = np.arange(len(unknown), dtype=np.float64)
             said = f"{int(np.count_nonzero(unknown))} times were interpolated"
@@ -195,9 +195,10 @@ def _undated(options: Options) -> str:
 
 def _missing(seq: Floats | None) -> list[str]:
     """That rows are missing, by their numbers."""
-    if seq is None or np.isnan(seq).any():
+    if seq is None or count_of(seq, np.isnan):
         return []
-    count = int(np.count_nonzero(np.diff(seq) > 1.0))
+    steps = (np.diff(seq[part.start : part.stop + 1]) for part in parts(len(seq) - 1, seq))
+    count = sum(int(np.count_nonzero(part > 1.0)) for part in steps)
     return [f"numbers are missing in {count} places, and what became of these packets is not known"] if count else []
 
 
@@ -217,15 +218,16 @@ def _outcomes(
     if "lost" in values:
         codes = _codes(values["lost"])
     elif arrived is not None and _are_flags(arrived):
-        codes = _codes(_as_flags(1.0 - arrived))
+        codes = _codes(column_of((_as_flags(1.0 - arrived[part]) for part in parts(len(arrived), arrived)), np.int8))
     else:
         known = next(column for column in (arrived, delay, rtt) if column is not None)
-        codes = np.where(np.isnan(known), np.int8(LOST), np.int8(RECEIVED))
+        told = (np.where(np.isnan(known[part]), LOST, RECEIVED) for part in parts(len(known), known))
+        codes = column_of(told, np.int8)
     if delay is None and rtt is None and arrived is not None and not _are_flags(arrived):
-        delay = arrived - sent
+        delay = column_of((arrived[part] - sent[part] for part in parts(len(sent), arrived, sent)), np.float64)
     for column in (delay, rtt):
         if column is not None:
-            np.copyto(column, np.nan, where=codes != RECEIVED)
+            forget(column, codes, RECEIVED)
     if rtt is not None and delay is None:
         return None, None, PacketOutcomes(codes, rtt)
     return PacketOutcomes(codes, delay), None, None
@@ -233,12 +235,13 @@ def _outcomes(
 
 def _codes(flags: NDArray[np.int8], untold: int = UNKNOWN) -> NDArray[np.int8]:
     """Outcomes of flags, `untold` where there is none."""
-    return np.array([RECEIVED, LOST, untold], dtype=np.int8)[flags]
+    codes = np.array([RECEIVED, LOST, untold], dtype=np.int8)
+    return column_of((codes[flags[part]] for part in parts(len(flags), flags)), np.int8)
 
 
 def _are_flags(column: Floats) -> bool:
     """Is a column `received` one of yes and no, and not of times?"""
-    return bool(((column == 0.0) | (column == 1.0)).all())
+    return all_of(column, lambda part: (part == 0.0) | (part == 1.0))
 
 
 def _overtaken(values: dict[str, NDArray[Any]], sent: Floats) -> int:
@@ -249,8 +252,7 @@ def _overtaken(values: dict[str, NDArray[Any]], sent: Floats) -> int:
             return 0
         arrived = None
     count, newest = 0, -np.inf
-    for first in range(0, len(sent), _PART):
-        part = slice(first, first + _PART)
+    for part in parts(len(sent), sent, delay, arrived):
         at = sent[part] + values["delay"][part] if arrived is None else arrived[part]
         at = np.append(newest, at[~np.isnan(at)])
         count += int(np.count_nonzero(at < np.maximum.accumulate(at)))

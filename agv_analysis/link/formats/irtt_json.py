@@ -20,8 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agv_analysis.compiled import HAS_NUMBA
 from agv_analysis.link.formats.format import Format, Options
+from agv_analysis.link.formats.irtt_shapes import Shapes, Trip
 from agv_analysis.link.formats.text_columns import Progress, chunks
+from agv_analysis.link.large_arrays import Column, column_of, count_of, forget, is_all_nan, parts
 from agv_analysis.link.measurement import (
     LOST,
     NOT_SENT,
@@ -32,14 +35,17 @@ from agv_analysis.link.measurement import (
     MeasurementError,
     PacketOutcomes,
 )
-from agv_analysis.link.packet_grid import Column
+from agv_analysis.link.packet_grid import count_on
 from agv_analysis.run import Floats
 
 _BEGIN = re.compile(rb'"round_trips"\s*:\s*\[')
 _INTERVAL = re.compile(rb'"interval"\s*:\s*(\d+)')
 _NS = 1e-9
-_BATCH = 1 << 16
-"""Bytes that are read at a time: what becomes of them fits the processor's cache."""
+_BATCH, _LARGE_BATCH = 1 << 16, 1 << 18
+"""Bytes that are read at a time, more of members that are written alike: what becomes of them fits the cache."""
+
+_MANY = 1 << 21
+"""Bytes of a file from which on members that are written alike are looked for: that takes a while to begin."""
 
 _WAYS = {
     "false": (RECEIVED, RECEIVED, RECEIVED),
@@ -51,10 +57,6 @@ _WAYS = {
 """Outcomes of the uplink, of the downlink and of the whole by irtt's word; the last: it says nothing."""
 
 _WORDS = {word: code for code, word in enumerate(_WAYS)} | {False: 0, True: 1}
-
-Trip = tuple[int, int, float, float, float, float, float]
-"""Number, place of the word in _WAYS, delays up, down and whole [ns], when it was sent [ns] by two clocks; NaN: not
-there."""
 
 
 def _matches(head: bytes, path: Path) -> bool:
@@ -74,16 +76,26 @@ class _Table:
     def extend(self, trips: list[Trip]) -> None:
         if trips:
             seq, word, *times = zip(*trips, strict=True)
-            self.seq.extend(np.array(seq, dtype=np.int64))
-            self.word.extend(np.array(word, dtype=np.int8))
-            for column, values in zip((*self.delays, *self.stamps), times, strict=True):
-                column.extend(np.array(values, dtype=np.float64) * _NS)
+            self.extend_columns(np.array(seq, dtype=np.int64), np.array(word, dtype=np.int8), np.array(times).T)
+
+    def extend_columns(self, seq: NDArray[np.int64], word: NDArray[np.int8], times: Floats) -> None:
+        """`times` [ns], shape (n, 5)."""
+        self.seq.extend(seq)
+        self.word.extend(word)
+        for i, column in enumerate((*self.delays, *self.stamps)):
+            column.extend(times[:, i] * _NS)
 
 
 def _read(path: Path, options: Options) -> Measurement:
     malformed, table, stated, number = Malformed(), _Table(), [0.0], 0
-    decode = _decoder()
-    for batch in _batches(path, options.progress, malformed, stated):
+    decode, shapes = _decoder(), Shapes(_trip) if HAS_NUMBA and path.stat().st_size > _MANY else None
+    size = _BATCH if shapes is None else _LARGE_BATCH
+    for batch in _batches(path, options.progress, malformed, stated, size):
+        if shapes is not None:
+            batch, alike = _without_alike(batch, shapes, table)
+            number += alike
+            if not batch:
+                continue
         trips = decode(batch)
         if trips is None:
             trips = []
@@ -102,10 +114,26 @@ def _read(path: Path, options: Options) -> Measurement:
     return _measurement(str(path), table, malformed, stated[0], options)
 
 
-def _batches(path: Path, progress: Progress | None, malformed: Malformed, stated: list[float]) -> Iterator[bytes]:
+def _without_alike(batch: bytes, shapes: Shapes, table: _Table) -> tuple[bytes, int]:
+    """What is left of a batch without the members that are written alike, which go into the table; how many they were.
+
+    Of its beginning: behind the first member that has no shape nothing is looked for.
+    """
+    at, count = 0, 0
+    while True:
+        alike = shapes.read(batch, at)
+        table.extend_columns(alike.seq, alike.word, alike.times)
+        at, count = alike.end, count + len(alike.seq)
+        if at >= len(batch) or not shapes.learn(batch, at):
+            return batch[at:], count
+
+
+def _batches(
+    path: Path, progress: Progress | None, malformed: Malformed, stated: list[float], size: int
+) -> Iterator[bytes]:
     """Members of `round_trips`, some at a time, with the commas between them. Into `stated` the interval [s]."""
     text, began = b"", False
-    for chunk in chunks(path, progress, _BATCH):
+    for chunk in chunks(path, progress, size):
         text += chunk
         if not began:
             begin = _BEGIN.search(text)
@@ -247,27 +275,29 @@ def _measurement(source: str, table: _Table, malformed: Malformed, stated: float
     seq, word, notes = table.seq.values, table.word.values, []
     delays, stamps = [column.values for column in table.delays], [column.values for column in table.stamps]
     duplicates = reordered = 0
-    if np.any(np.diff(seq) <= 0):
+    if any(np.any(np.diff(seq[part.start : part.stop + 1]) <= 0) for part in parts(len(seq) - 1, seq)):
         order = np.argsort(seq, kind="stable")
         reordered = int(np.count_nonzero(np.diff(order) < 0))
         kept = order[np.append(True, np.diff(seq[order]) > 0)]
         duplicates = len(order) - len(kept)
         seq, word = seq[kept], word[kept]
         delays, stamps = [column[kept] for column in delays], [column[kept] for column in stamps]
-    up, down, whole = np.array(list(_WAYS.values()), dtype=np.int8).T[:, word]
+    up, down, whole = (
+        column_of((codes[word[part]] for part in parts(len(word), word)), np.int8)
+        for codes in np.array(list(_WAYS.values()), dtype=np.int8).T
+    )
     missing = int(seq[-1] - seq[0]) + 1 - len(seq)
     if missing:
         notes.append(f"{missing} numbers are missing from the file, and what became of these packets is not known")
-    blind = int(np.count_nonzero((up == UNKNOWN) & (whole == LOST)))
+    blind = count_of(word, lambda part: part == _WORDS["true"])
     if blind:
         notes.append(f"of {blind} lost packets irtt does not know on which way (lost is true): see --stats of irtt")
-    untold = int(np.count_nonzero(whole == UNKNOWN))
+    untold = count_of(word, lambda part: part == _WORDS[""])
     if untold:
         notes.append(f"of {untold} packets the file does not say what became of them")
-    np.copyto(delays[0], np.nan, where=up != RECEIVED)
-    for delay in delays[1:]:
-        np.copyto(delay, np.nan, where=whole != RECEIVED)
-    found = [None if np.isnan(delay).all() else delay for delay in delays]
+    for delay, codes in zip(delays, (up, whole, whole), strict=True):
+        forget(delay, codes, RECEIVED)
+    found = [None if is_all_nan(delay) else delay for delay in delays]
     if found[0] is not None:
         notes.append("delays of each direction are as good as the two clocks agree")
     sent, said = _times(seq, stamps, options.interval or stated)
@@ -283,7 +313,7 @@ def _times(seq: NDArray[np.int64], stamps: Iterable[Floats], interval: float) ->
 
     The clock is the first one that most packets have a stamp of.
     """
-    counted = [(int(np.count_nonzero(~np.isnan(clock))), clock) for clock in stamps]
+    counted = [(count_of(clock, lambda part: ~np.isnan(part)), clock) for clock in stamps]
     known, clock = max(counted, key=lambda one: one[0])
     if known < 2:
         said = "" if interval else ": 1 s is assumed between them; say otherwise with --interval"
@@ -292,8 +322,8 @@ def _times(seq: NDArray[np.int64], stamps: Iterable[Floats], interval: float) ->
     if known < len(clock):
         is_known = ~np.isnan(clock)
         clock = np.interp(seq.astype(np.float64), seq[is_known].astype(np.float64), clock[is_known])
-    clock = clock - clock[0]
-    return np.maximum.accumulate(clock, out=clock), ()
+    count_on(clock)
+    return clock, ()
 
 
 FORMAT = Format("irtt", "JSON of irtt client -o", 10, _matches, _read)

@@ -14,13 +14,13 @@ import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.rows import parts_of_rows
+from agv_analysis.link.large_arrays import is_all_nan
 from agv_analysis.link.measurement import (
-    RECEIVED,
-    UNKNOWN,
     Malformed,
     Measurement,
     PacketOutcomes,
     needs_packets,
+    of_one_way,
 )
 from agv_analysis.link.packet_grid import PacketGrid
 
@@ -58,8 +58,8 @@ def _read(path: Path, options: Options) -> Measurement:
     ]
     grid = found.whole(interval, first=0)
     up, down, rtt = grid.delays
-    either = np.where(grid.outcome == RECEIVED, RECEIVED, UNKNOWN).astype(np.int8)
-    directions = [PacketOutcomes(either, None if np.isnan(delay).all() else delay) for delay in (up, down)]
+    either = of_one_way(grid.outcome)
+    directions = [PacketOutcomes(either, None if is_all_nan(delay) else delay) for delay in (up, down)]
     return Measurement(
         source=str(path), format="irtt -r", sent=grid.sent, uplink=directions[0], downlink=directions[1],
         round_trip=PacketOutcomes(grid.outcome, rtt), duplicates=duplicates + grid.duplicates,

@@ -13,6 +13,7 @@ import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.rows import parts_of_rows
+from agv_analysis.link.large_arrays import Column
 from agv_analysis.link.measurement import (
     RECEIVED,
     Malformed,
@@ -21,7 +22,6 @@ from agv_analysis.link.measurement import (
     PacketOutcomes,
     needs_packets,
 )
-from agv_analysis.link.packet_grid import Column
 
 _USUAL_INTERVAL = 0.005
 """Time between the packets that are asked about [s]: the usual sampling period."""

@@ -8,6 +8,7 @@ was lost has RTIME 0. Lines come in the order of arrival. Source: owping(1); RFC
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,15 @@ from numpy.typing import NDArray
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.rows import lines_of_words
 from agv_analysis.link.formats.text_columns import head_of, numbers_at
+from agv_analysis.link.large_arrays import Column, column_of, parts
 from agv_analysis.link.measurement import LOST, RECEIVED, Malformed, Measurement, PacketOutcomes, needs_packets
+from agv_analysis.link.packet_grid import count_on
+from agv_analysis.run import Floats
 
 _COLUMNS = (8, 7)
 """Words of a line; older versions have no TTL."""
+
+Stamps = NDArray[np.uint64]
 
 _SECOND = 2.0**-32
 
@@ -33,7 +39,7 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed, parts = Malformed(), []
+    malformed, found = Malformed(), tuple(Column(np.uint64) for _ in range(3))
     for block, words in lines_of_words(path, _words(path), malformed, options.progress):
         columns = [numbers_at(block.text, words.begins[:, i]) for i in (0, 1, 4)]
         good = np.ones(len(words.lines), dtype=np.bool_)
@@ -41,10 +47,11 @@ def _read(path: Path, options: Options) -> Measurement:
             good &= numbers.length == words.ends[:, i] - words.begins[:, i]
         for i in np.flatnonzero(~good).tolist():
             malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
-        parts.append(np.stack([numbers.digits[good] for numbers in columns]))
-    found = np.concatenate(parts, axis=1) if parts else np.zeros((3, 0), dtype=np.uint64)
-    needs_packets(found.shape[1], str(path), "line of a packet", malformed)
-    return _measurement(str(path), found, malformed)
+        for column, numbers in zip(found, columns, strict=True):
+            column.extend(numbers.digits[good])
+    needs_packets(len(found[0]), str(path), "line of a packet", malformed)
+    seq, sent, received = (column.values for column in found)
+    return _measurement(str(path), seq, sent, received, malformed)
 
 
 def _words(path: Path) -> int:
@@ -54,19 +61,28 @@ def _words(path: Path) -> int:
     return _COLUMNS[0]
 
 
-def _measurement(source: str, found: NDArray[np.uint64], malformed: Malformed) -> Measurement:
-    seq = found[0].astype(np.int64)
-    arrived = seq[found[2] > 0]
-    reordered = int(np.count_nonzero(arrived < np.maximum.accumulate(arrived))) if len(arrived) else 0
-    _, at = np.unique(seq, return_index=True)
-    sent, received = found[1][at], found[2][at]
-    is_lost = received == 0
-    delay = np.where(is_lost, np.nan, (received - sent).astype(np.int64) * _SECOND)  # wraps, so negative ones come out
-    times = (sent - sent[0]).astype(np.int64) * _SECOND
+def _measurement(source: str, seq: Stamps, sent: Stamps, received: Stamps, malformed: Malformed) -> Measurement:
+    count, reordered, newest = len(seq), 0, np.uint64(0)
+    for part in parts(count, seq, received):
+        arrived = np.append(newest, seq[part][received[part] > 0])
+        reordered += int(np.count_nonzero(arrived < np.maximum.accumulate(arrived)))
+        newest = arrived.max()
+    if any(np.any(seq[part.start + 1 : part.stop + 1] <= seq[part]) for part in parts(count - 1, seq)):
+        _, at = np.unique(seq, return_index=True)
+        seq, sent, received = seq[at], sent[at], received[at]
+
+    def delays() -> Iterator[Floats]:
+        for part in parts(len(seq), sent, received):
+            delay = (received[part] - sent[part]).astype(np.int64) * _SECOND  # wraps, so negative ones come out
+            yield np.where(received[part] == 0, np.nan, delay)
+
+    outcomes = (np.where(received[part] == 0, LOST, RECEIVED) for part in parts(len(seq), received))
+    times = column_of(((sent[part] - sent[0]).astype(np.int64) * _SECOND for part in parts(len(seq), sent)), np.float64)
+    count_on(times)
     return Measurement(
-        source=source, format="owping", sent=np.maximum.accumulate(times),
-        uplink=PacketOutcomes(np.where(is_lost, LOST, RECEIVED).astype(np.int8), delay),
-        duplicates=len(seq) - len(at), reordered=reordered, malformed=malformed,
+        source=source, format="owping", sent=times,
+        uplink=PacketOutcomes(column_of(outcomes, np.int8), column_of(delays(), np.float64)),
+        duplicates=count - len(seq), reordered=reordered, malformed=malformed,
         notes=("one direction was measured, and is taken for the uplink; delays are as good as the two clocks agree",),
     )  # fmt: skip
 

@@ -178,6 +178,42 @@ def test_irtt_reads_the_same_with_and_without_msgspec(tmp_path: Path, monkeypatc
         np.testing.assert_array_equal(one.delay, other.delay)
 
 
+@pytest.mark.parametrize("indent", [None, 4])
+def test_irtt_that_is_written_alike_reads_as_the_json_module_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, indent: int | None
+) -> None:
+    from agv_analysis.link.formats import irtt_json
+
+    rng, trips = np.random.default_rng(1), []
+    for i in range(3000):
+        stamp = {"wall": 1_700_000_000_000_000_000 + 20_000_000 * i, "monotonic": 20_000_000 * i - 10**9}
+        delay = {"receive": int(rng.integers(0, 10**8)), "rtt": int(rng.integers(0, 10**9)), "send": -int(i % 7)}
+        trip: dict[str, object] = {
+            "seqno": i, "lost": "false", "note": 'seqno 12: "7"', "timestamps": {"client": {"send": stamp}},
+            "delay": delay, "ipdv": {"rtt": 3},
+        }  # fmt: skip
+        kind = int(rng.integers(0, 30))
+        if kind < 4:
+            trip = {"seqno": i, "lost": ("true_up", "true_down", "true", True)[kind], "timestamps": {}, "delay": {}}
+        elif kind < 8:  # what has no shape, or another one each time
+            odd = (1.5, 10**25, [1] * i, f"note {i}")[kind - 4]
+            trip = {**trip, "delay": {**delay, "rtt": 5.5e6}} if kind == 4 else {**trip, "odd": odd}
+        trips.append(trip)
+    text = json.dumps({"config": {"params": {"interval": 20_000_000}}, "round_trips": trips}, indent=indent)
+    text = text.replace('"seqno": 1500,', '"seqno": 01500,')  # which is no number of JSON
+    monkeypatch.setattr(irtt_json, "_decoder", lambda: irtt_json._decode_as_json)
+    expected = read(tmp_path / "a", text)
+    monkeypatch.setattr(irtt_json, "_MANY", 0)
+    found = read(tmp_path / "a", text)
+    assert expected.malformed.count == 1
+    assert (found.packets, found.notes, found.malformed) == (2999, expected.notes, expected.malformed)
+    np.testing.assert_array_equal(found.sent, expected.sent)
+    for name in ("uplink", "downlink", "round_trip"):
+        one, other = getattr(found, name), getattr(expected, name)
+        np.testing.assert_array_equal(one.outcome, other.outcome)
+        np.testing.assert_array_equal(one.delay, other.delay)
+
+
 def test_irtt_whose_members_are_longer_than_what_is_read_at_a_time(tmp_path: Path) -> None:
     trips: list[object] = [{"seqno": i, "lost": "false", "note": "x" * 100_000, "delay": {"rtt": i}} for i in range(5)]
     found = read(tmp_path / "a", irtt(trips))
