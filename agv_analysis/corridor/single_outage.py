@@ -52,7 +52,7 @@ class SingleOutage:
 
 def single_outage(loop: LapLoop) -> SingleOutage:
     """The longest one. Outages of all shorter lengths stay inside as well, as far as the places that were tried."""
-    shortest = _shortest_leaving(loop, max(1, loop.steps // _PLACES))
+    shortest = _shortest_leaving(loop)
     if shortest is None:
         many = max(1, loop.steps // _MANY)
         all_inside, _ = loop.excursions(outage(LONGEST), many)
@@ -90,9 +90,28 @@ def _from_all_steps(loop: LapLoop, n: int) -> Excursions:
 
 
 def roughly(loop: LapLoop, places: int = FEW_PLACES) -> int | None:
-    """As `single_outage().n`, from some places of the lap, and none of shorter outages: in a tenth of a second."""
-    shortest = _shortest_leaving(loop, max(1, loop.steps // places), shorter=0)
-    return None if shortest is None else shortest - 1
+    """As `single_outage().n`, from some places of the lap, and none of shorter outages: in a tenth of a second.
+
+    The longest outage that is tried shows after how many losses one is outside while it lasts. A shorter one may be so
+    afterwards: these are tried from there downwards.
+    """
+    every = max(1, loop.steps // places)
+
+    def tried(n: int) -> Excursions:
+        return loop.excursions(outage(n), every, limit=1.0)[0]
+
+    longest = tried(LONGEST)
+    leaves = longest.share > 1.0
+    if not leaves.any():
+        return None
+    outside = min(LONGEST, max(0, int(longest.after[leaves].min()) - 1))
+    inside, step = outside - 1, 1
+    while inside >= 0 and tried(inside).share.max() > 1.0:
+        inside, outside, step = max(-1, inside - step), inside, 2 * step
+    while outside - inside > 1:
+        middle = (inside + outside) // 2
+        inside, outside = (inside, middle) if tried(middle).share.max() > 1.0 else (middle, outside)
+    return inside
 
 
 def _found(loop: LapLoop, n: int | None, step: int, inside: Excursions) -> SingleOutage:
@@ -102,22 +121,14 @@ def _found(loop: LapLoop, n: int | None, step: int, inside: Excursions) -> Singl
     return SingleOutage(n, step, x, y, float(np.nanmax(np.hypot(inside.along, inside.across))), shares)
 
 
-def _shortest_leaving(loop: LapLoop, every: int, shorter: int = _SHORTER) -> int | None:
+def _shortest_leaving(loop: LapLoop) -> int | None:
     """Shortest outage that leads outside from one of some places; None if there is none up to LONGEST.
 
-    By bisection, and by so many of those that are `shorter` than what it finds.
+    As `roughly` finds it, and by some of those that are shorter.
     """
-
-    def leaves(n: int) -> bool:
-        return bool(loop.excursions(outage(n), every, limit=1.0)[0].share.max() > 1.0)
-
-    inside, outside = -1, 0
-    while not leaves(outside):
-        if outside == LONGEST:
-            return None
-        inside, outside = outside, min(LONGEST, 2 * outside + 1)
-    while outside - inside > 1:
-        middle = (inside + outside) // 2
-        inside, outside = (inside, middle) if leaves(middle) else (middle, outside)
-    tried = np.unique(np.linspace(0, max(0, outside - 1), shorter).astype(int)).tolist()
-    return next((n for n in tried if leaves(n)), outside)
+    n = roughly(loop, _PLACES)
+    if n is None:
+        return None
+    every = max(1, loop.steps // _PLACES)
+    shorter = np.unique(np.linspace(0, max(0, n), _SHORTER).astype(int)).tolist()
+    return next((one for one in shorter if loop.excursions(outage(one), every, limit=1.0)[0].share.max() > 1.0), n + 1)
