@@ -66,6 +66,9 @@ _DOUBTFUL = 0.1
 _PLACES, _DOUBTFUL_AT_PLACES = 2000, 10.0
 """Places of a lap, at least, at which a growth is asked for first, and up to which size it does not tell the sign."""
 
+_LONG = 0.1
+"""Share of a lap from which on outages are too long, on average, to be asked for at places of it."""
+
 
 def step_maps(loop: LinearLoop, k: int = 0) -> tuple[Floats, Floats]:
     """(A_1, A_0) of step k: maps of (z, h) at a reception and at a loss, shape (m + q, m + q) each."""
@@ -311,15 +314,17 @@ def loss_borders(loop: LinearLoop) -> tuple[float, ...]:
         return growth
 
     grid = np.append(1.0 - np.logspace(0.0, math.log10(1.0 - MOST_LOST), _TRIED), [] if loop.predicts else [1.0])
-    return borders(_sign_first(loop, growth_of), grid.tolist())
+    return borders(_sign_first(loop, growth_of, lambda p: 1.0 / (1.0 - p) if p < 1.0 else math.inf), grid.tolist())
 
 
 def _sign_first(
-    loop: LinearLoop, growth_of: Callable[[LinearLoop], Callable[[float, float], float]]
-) -> Callable[[float], float]:
+    loop: LinearLoop, growth_of: Callable[[LinearLoop], Callable[[float, float], float]],
+    burst_of: Callable[[float], float],
+) -> Callable[[float], float]:  # fmt: skip
     """A growth over a lap that is exact only where its sign is in doubt; values are kept.
 
-    Elsewhere it is that of some places of the lap, or roughly settled.
+    Elsewhere it is that of some places of the lap, where outages are short, or roughly settled. `burst_of`: their mean
+    length in steps.
     """
     thinned = loop.thinned(_PLACES)
     growth, at_places = growth_of(loop), growth_of(thinned)
@@ -327,7 +332,8 @@ def _sign_first(
 
     @functools.cache
     def found(x: float) -> float:
-        if ratio > 1.0 and abs(guess := ratio * at_places(x, _ROUGHLY)) > _DOUBTFUL_AT_PLACES:
+        is_short = ratio > 1.0 and burst_of(x) < _LONG * loop.steps
+        if is_short and abs(guess := ratio * at_places(x, _ROUGHLY)) > _DOUBTFUL_AT_PLACES:
             return guess
         rough = growth(x, _ROUGHLY)
         return rough if abs(rough) > _DOUBTFUL else growth(x, SETTLED)
@@ -357,7 +363,7 @@ def burst_borders(loop: LinearLoop, loss_rate: float) -> tuple[float, ...]:
             lap_growth(part, bursty(loss_rate, burst), moments, settled) - MARGINAL * part.steps
         )
 
-    signed, grid, end = _sign_first(loop, growth_of), [shortest], LONGEST_BURST
+    signed, grid, end = _sign_first(loop, growth_of, lambda burst: burst), [shortest], LONGEST_BURST
     while grid[-1] < end:
         if end == LONGEST_BURST and signed(grid[-1]) >= 0.0:
             end = min(end, 8.0 * grid[-1])

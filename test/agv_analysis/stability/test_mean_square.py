@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ from agv_analysis.link.markov_channel import Chain, bernoulli, bursty, gilbert_e
 from agv_analysis.stability.first_border import crossing
 from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.mean_square import (
+    _sign_first,
     along_spectral_radius,
     critical_burst,
     critical_loss,
@@ -242,3 +244,13 @@ def test_the_mean_square_of_many_runs() -> None:
     for k in range(10):
         moments = A @ moments
         assert squares[k] == pytest.approx(moments[0], rel=0.1)
+
+
+def test_of_long_outages_the_whole_lap_is_asked() -> None:
+    lap = kanayama_loop(np.linspace(0.5, 1.5, 20_000), np.zeros(20_000), ControllerParameters(), 0.005)
+
+    def growth_of(part: LinearLoop) -> Callable[[float, float], float]:
+        return lambda burst, settled: 50.0 if part.steps == lap.steps else -50.0
+
+    signed = _sign_first(lap, growth_of, lambda burst: burst)
+    assert [math.copysign(1.0, signed(burst)) for burst in (5.0, 1999.0, 2000.0, 1e6)] == [-1.0, -1.0, 1.0, 1.0]
