@@ -12,6 +12,7 @@ import pytest
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate
+from agv_analysis.stability.analysis import analyse
 from agv_analysis.stability.repeated_run import RepeatedRun, repeated_run, settles_without_losses
 from agv_analysis.stability.scenario_loop import loop_of_run
 
@@ -86,6 +87,19 @@ def test_a_limit_on_the_speed_does_not_keep_an_agv_that_turns_around(v_max: floa
     drift = deviations(run.scenario, run.lost.tolist(), 400.0)
     assert drift[-1] > 1.8 * drift[len(drift) // 2] > 300.0
     assert not found.stays
+
+
+@pytest.mark.parametrize("v_max", [1.05, 6.0])
+def test_an_agv_that_stays_by_symmetry_alone_is_not_bounded(v_max: float) -> None:
+    """Exactly on its line, ahead of its reference, it never turns; 1 mm beside, the same loop drives away for ever."""
+    on_line = (*TURNED, f"plant.initial_pose=[0.0, 5.0, {math.pi / 2}]", f"controller.v_max={v_max}")
+    run, found = repeated(*on_line)
+    assert np.hypot(*(run.pose - run.reference[:, :3])[-2000:, :2].T).max() < 1.0
+    beside = dataclasses.replace(run.scenario.plant, initial_pose=(1e-3, 5.001, math.pi / 2 + 1e-3))
+    drift = deviations(dataclasses.replace(run.scenario, plant=beside), run.lost.tolist(), 400.0)
+    assert drift[-1] > 1.8 * drift[len(drift) // 2] > 300.0
+    assert not found.stays
+    assert analyse(run).verdict.word == "unstable"
 
 
 def test_a_loop_that_falls_behind_does_not_settle() -> None:
