@@ -1,4 +1,4 @@
-"""Outages that repeat: the period of a recorded series of outcomes."""
+"""Outages that repeat: the period of a recorded series of outcomes, and the outcomes of a schedule that is known."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
 from agv_analysis.link.reception_intervals import Outcomes, Steps
+from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.delay import whole_slots
 
 _PERIODS = 3
 """Fewest periods that a recording must show, and twice as many changes between lost and received."""
@@ -27,6 +29,22 @@ def period_of(k: Steps, lost: Outcomes) -> int | None:
         if begin <= 2 * period and _PERIODS * period <= len(rest):
             return period
     return None
+
+
+_LONGEST = 1_000_000
+"""Slots of a schedule's period that are looked at."""
+
+
+def scripted_outages(channel: ChannelParameters, ts: float) -> Outcomes | None:
+    """Outcomes of one period of a link that loses nothing but what its schedule has lost again and again, shape (P,).
+
+    `ts` is the period of slots [s]. None for any other link, for one that loses everything, and for a long period.
+    """
+    if channel.model != "perfect" or len(channel.entries) != 1:
+        return None
+    outage = channel.entries[0].outage
+    period, slots = whole_slots(outage.period / ts), whole_slots(outage.length / ts)
+    return np.arange(period) < slots if 0 < slots < period <= _LONGEST else None
 
 
 def _smallest_period(lost: Outcomes, borders: NDArray[np.int64]) -> int:

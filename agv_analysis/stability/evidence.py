@@ -12,12 +12,13 @@ from agv_analysis.link import joint_chain
 from agv_analysis.link.channel_fit import ChannelFit
 from agv_analysis.link.joint_chain import JointChain
 from agv_analysis.link.markov_channel import Chain, chain_of, gilbert_elliott
-from agv_analysis.link.periodic_outages import period_of
+from agv_analysis.link.periodic_outages import period_of, scripted_outages
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability import lifted, mean_square, mean_square_two_links
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence, link_confidence
+from agv_analysis.stability.confidence.segment_confidence import growth_of_period
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.any_outages import largest_n, longest_for
 from agv_analysis.stability.criteria.criterion import PLACES_OF_LONG_LAP, Judgement, RunFacts, has_late
@@ -197,6 +198,9 @@ def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Jud
         of_channel = growth_of_channel(facts.loop, relay, run.ts)
         if isinstance(of_channel, float):
             return _with_growth(replace(common, is_unlimited=True), of_channel, "late_and_lost")
+    scripted = scripted_outages(relay.uplink, run.ts)
+    if scripted is not None and downlink is not None and downlink.loss_rate == 0.0 and not facts.is_late:
+        return _with_growth(replace(common, n=int(scripted.sum())), growth_of_period(facts.loop, scripted))
     if facts.is_late or uplink is None or downlink is None:
         return _under_links_as_seen(common, facts, judgements)
     if downlink.loss_rate == 0.0:

@@ -140,10 +140,7 @@ def _of_exact_predictor(loop: LinearLoop, lost: Outcomes) -> _Found:
 
 def _of_period(loop: LinearLoop, lost: Outcomes, period: int) -> _Found:
     """By the multiplier of the outcomes' own period; that they go on so is as sure as the periods seen make it."""
-    periods = len(lost) // period
-    last = lost[-period:]
-    pattern = np.roll(last, -int(np.argmin(last)))  # from a reception on
-    growth = 2.0 * float(drop_sequence(loop, np.resize(pattern, _whole(loop, period)), 1)[0]) / _whole(loop, period)
+    periods, growth = len(lost) // period, growth_of_period(loop, lost[-period:])
     goes_on = (periods + 0.5) / (periods + 1.0)
     stable = growth < MARGINAL
     why = f"the outcomes repeat every {period} slots, {periods} times, and over their period the error " + (
@@ -152,6 +149,13 @@ def _of_period(loop: LinearLoop, lost: Outcomes, period: int) -> _Found:
     needed = 0.5 / (1.0 - SURE)
     probability = goes_on if stable else 1.0 - goes_on
     return _Found(PERIODIC, probability, growth, (growth, growth), max(1.0, needed / periods), why)
+
+
+def growth_of_period(loop: LinearLoop, pattern: Outcomes) -> float:
+    """Growth of E[e^2] (logarithm, per step) if outcomes, shape (P,), of which some are received, repeat for ever."""
+    steps = _whole(loop, len(pattern))
+    from_reception = np.roll(pattern, -int(np.argmin(pattern)))
+    return 2.0 * float(drop_sequence(loop, np.resize(from_reception, steps), 1)[0]) / steps
 
 
 def _whole(loop: LinearLoop, period: int) -> int:

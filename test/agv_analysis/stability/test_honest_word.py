@@ -104,6 +104,29 @@ def test_outages_by_the_clock_are_no_gilbert_channel() -> None:
     assert found.to_json()["stationarity"] is not None
 
 
+@pytest.mark.parametrize(("outage", "period", "kx"), [(0.2, 20.0, 25.0), (0.055, 0.065, 25.0), (0.2, 0.23, 25.0)])
+def test_a_schedule_of_outages_is_known_however_few_a_lap_shows(outage: float, period: float, kx: float) -> None:
+    """The growth is that of the product of the steps of one period on the line, with matrices written out."""
+    rotation, ts = np.eye(3), 0.005
+    rotation[1, 2] = ts
+    held = -ts * np.array([[kx, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 2.0]])
+    product = np.eye(3)
+    lost, slots = round(outage / ts), round(period / ts)
+    for k in range(slots - lost):
+        interval = np.eye(3)
+        together = np.zeros((3, 3))
+        for _ in range(lost + 1 if k == 0 else 1):
+            together = rotation @ together + held
+            interval = rotation @ interval
+        product = (interval + together) @ product
+    growth = 2.0 * np.log(np.abs(np.linalg.eigvals(product)).max()) / slots
+    scenario = scenario_of(LINE, f"relay.uplink.schedule=0: outage={outage} every {period}", f"controller.kx={kx}")
+    found = evidence_of_scenario(scenario)
+    assert found.growth == pytest.approx(growth, abs=1e-9)
+    assert (decide(found).word in GREEN) == (growth < 0.0)
+    assert found.n == lost
+
+
 @pytest.mark.parametrize(("n", "is_stable"), [(10, True), *((n, False) for n in (16, 200, 999, 20_000, 10**6))])
 def test_outages_that_repeat_are_judged_by_their_own_length_however_long_they_are(n: int, is_stable: bool) -> None:
     """Along the line an outage of n slots multiplies the error by 1 - (n + 1) / 8; at n = 15 by -1."""
