@@ -75,9 +75,15 @@ def until_first_outage(run: Run, body: Floats, why: str) -> InitialError:
     return _unless_there_is_more(found, np.hypot(body[: end + 1, 0], body[: end + 1, 1]), why)
 
 
+_JITTER = 1
+"""By receive time a pose may be so many steps old without having been late."""
+
+
 def first_outage(run: Run) -> int:
-    """Index of the first slot in which a message was lost or late, N if there is none."""
+    """Index of the first slot in which a message was lost, or late by its slot or by when it came; N if there is none."""
     late = np.zeros_like(run.lost) if run.n_dl is None else run.n_dl > 0
+    if run.is_late:
+        late = late | (run.command_age > _JITTER)
     disturbed = np.flatnonzero(run.lost | run.downlink_lost | (run.n_ul > 0) | late)
     return int(disturbed[0]) if len(disturbed) else len(run)
 

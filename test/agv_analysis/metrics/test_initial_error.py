@@ -23,7 +23,7 @@ from agv_analysis.metrics.initial_error import (
 )
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.table import convergence_rows
-from agv_analysis.run import Run
+from agv_analysis.run import Run, Timing
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.stability.analysis import observe
@@ -281,6 +281,16 @@ def test_without_a_twin_the_first_outage_is_the_end() -> None:
     assert before.settle_2pct_steps == math.ceil(math.log(0.02) / math.log(0.9))
     assert f"first outage, at step {at - 1}, came before" in before.initial.reason
     assert "gains are not known" in before.initial.reason
+
+
+def test_poses_that_came_late_end_it_as_lost_ones_do() -> None:
+    """Nothing is lost, but from step 150 on poses wait, and the AGV goes 0.1 m astray: not its initial error."""
+    run = another_robots()
+    pose, age = run.pose.copy(), np.where(run.k >= 150, run.k - 150, 0)
+    pose[160:200, 1] += 0.1
+    found = convergence(dataclasses.replace(run, pose=pose, timing=Timing(is_late=True, command_age=age)))
+    assert found.settle_1cm_steps == math.ceil(math.log(0.002) / math.log(0.9))
+    assert found.initial.of == UNTIL_FIRST_OUTAGE
 
 
 @pytest.mark.parametrize("step", [0, 1])
