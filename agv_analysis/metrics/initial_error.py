@@ -80,7 +80,7 @@ _JITTER = 1
 
 
 def first_outage(run: Run) -> int:
-    """Index of the first slot in which a message was lost, or late by its slot or by when it came; N if there is none."""
+    """Index of the first slot in which a message was lost or late, by its slot or by when it came; N: there is none."""
     late = np.zeros_like(run.lost) if run.n_dl is None else run.n_dl > 0
     if run.is_late:
         late = late | (run.command_age > _JITTER)

@@ -69,17 +69,21 @@ class IntervalGrowth:
         return float(np.mean(self.samples < MARGINAL))
 
 
-def interval_growth(loop: LinearLoop, lengths: Lengths, longest: int, dependent: bool) -> IntervalGrowth:
+def interval_growth(
+    loop: LinearLoop, lengths: Lengths, longest: int, dependent: bool, move: float = 0.0
+) -> IntervalGrowth:
     """Growth for intervals `lengths` [steps] in the order of time, shape (n,), n >= 1; the least sure one over blocks.
 
     `longest` is the longest interval seen, complete or not. Blocks of 1, 2, 4, ... intervals are looked at where they
-    are `dependent`, else single ones.
+    are `dependent`, else single ones. `move` is what the mean over a few places of the lap leaves out of the growth per
+    step, as of `growth_posterior.moved`: that of a Gilbert channel with the same transitions.
     """
     steps = places(loop)
     found = [_of_independent(loop, steps, lengths, longest)]
     if dependent:
         found += _of_blocks(loop, steps, lengths)
-    return min(found, key=lambda one: one.probability_stable)
+    moved = [IntervalGrowth(one.growth + move, one.samples + move, one.block) for one in found]
+    return min(moved, key=lambda one: one.probability_stable)
 
 
 def _of_independent(loop: LinearLoop, steps: NDArray[np.int64], lengths: Lengths, longest: int) -> IntervalGrowth:

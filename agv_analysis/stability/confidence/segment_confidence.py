@@ -123,7 +123,7 @@ def _judge(loop: LinearLoop, k: Steps, lost: Outcomes, intervals: Intervals, goo
     if goodness.fits or not enough:
         posterior = GrowthPosterior(loop, count_transitions(k, lost), move)
         return _of_gilbert(posterior, intervals, goodness)
-    return _of_intervals(loop, intervals, goodness)
+    return _of_intervals(loop, intervals, goodness, move)
 
 
 def _of_exact_predictor(loop: LinearLoop, lost: Outcomes) -> _Found:
@@ -183,11 +183,11 @@ def _of_gilbert(posterior: GrowthPosterior, intervals: Intervals, goodness: Good
     return _Found(GILBERT, probability, posterior.estimate, posterior.interval, longer, why)
 
 
-def _of_intervals(loop: LinearLoop, intervals: Intervals, goodness: Goodness) -> _Found:
+def _of_intervals(loop: LinearLoop, intervals: Intervals, goodness: Goodness, move: float) -> _Found:
     lengths = intervals.between_receptions
     tested = (goodness.gap_lengths, goodness.longest_gap, goodness.independence)
     dependent = any(p is not None and p < SIGNIFICANCE for p in tested)
-    found = interval_growth(loop, lengths, intervals.longest + 1, dependent)
+    found = interval_growth(loop, lengths, intervals.longest + 1, dependent, move)
     probability, heavy = found.probability_stable, tail_is_heavy(intervals.outages)
     why = "outages are those of no Gilbert channel, so the intervals between receptions were judged as they are"
     if found.block > 1:
