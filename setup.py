@@ -97,6 +97,7 @@ setup(
             "error_detector = agv_analysis.runtime.executables:error_detector",
             "controller = agv_analysis.runtime.executables:controller",
             "recorder = agv_analysis.runtime.executables:recorder",
+            "link_emulator = agv_analysis.runtime.executables:link_emulator",
         ],
     },
 )

@@ -83,25 +83,12 @@ class RelayNode(LoopNode[RelayParameters]):
 
     def facts(self) -> dict[str, str]:
         """What each link did to its messages so far."""
-        return _counts("uplink", self.uplink) | _counts("downlink", self.downlink)
+        return self.uplink.facts("uplink") | self.downlink.facts("downlink")
 
     def on_settings(self) -> None:
         """Changed loss parameters hold from the next slot on."""
         self.uplink.channel.parameters = self.settings.uplink
         self.downlink.channel.parameters = self.settings.downlink
-
-
-def _counts(name: str, link: Link) -> dict[str, str]:
-    rate = link.lost / link.sent if link.sent else 0.0
-    return {
-        f"{name} sent": str(link.sent),
-        f"{name} lost": str(link.lost),
-        f"{name} loss rate": f"{rate:.6f}",
-        f"{name} longest outage [slots]": str(link.longest),
-        f"{name} delayed": str(link.delayed),
-        f"{name} duplicated": str(link.copies),
-        f"{name} expired": str(link.expired),
-    }
 
 
 def _place_in(pose: bytes, is_odometry: bool, last: tuple[float, float]) -> tuple[float, float]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from rclpy.duration import Duration
+import importlib
+from typing import NamedTuple
+
+from rclpy.duration import Duration, Infinite
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from agv_ros.errors import UserError
 from agv_ros.stamps import to_nanoseconds
 
 # Deep enough that a reader which falls behind for seconds, the recorder above all, still gets every message, even in
@@ -63,3 +67,69 @@ class Output:
     def flush(self, seconds: float) -> bool:
         """Wait until every subscriber has what was sent, `seconds` at most; do they have it?"""
         return bool(self._publisher.wait_for_all_acked(Duration(nanoseconds=to_nanoseconds(seconds))))
+
+
+class Offer(NamedTuple):
+    """What the publishers of a topic offer together."""
+
+    type_name: str
+    """As in sensor_msgs/msg/LaserScan."""
+    is_reliable: bool
+    """Do all of them send again what was lost?"""
+    is_latched: bool
+    """Do all of them send what was sent before to those who come later?"""
+    deadline: Duration | None
+    lifespan: Duration | None
+    """The longest; None if one has no limit."""
+
+    def profile(self, depth: int) -> QoSProfile:
+        """A subscription's that hears all of them, keeping `depth` messages."""
+        return QoSProfile(
+            depth=depth,
+            reliability=ReliabilityPolicy.RELIABLE if self.is_reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if self.is_latched else DurabilityPolicy.VOLATILE,
+        )
+
+    def passed_on(self, depth: int) -> QoSProfile:
+        """A publisher's that offers the same."""
+        profile = self.profile(depth)
+        if self.deadline is not None:
+            profile.deadline = self.deadline
+        if self.lifespan is not None:
+            profile.lifespan = self.lifespan
+        return profile
+
+
+def offer_of(node: Node, topic: str) -> Offer | None:
+    """What is offered on a topic, by its full name, as far as it has been discovered; None if it is not published.
+
+    Of several types the first counts.
+    """
+    infos = node.get_publishers_info_by_topic(topic)
+    if not infos:
+        return None
+    own = [info.qos_profile for info in infos if info.topic_type == infos[0].topic_type]
+    return Offer(
+        infos[0].topic_type,
+        all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in own),
+        all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in own),
+        _longest([qos.deadline for qos in own]),
+        _longest([qos.lifespan for qos in own]),
+    )
+
+
+def _longest(durations: list[Duration]) -> Duration | None:
+    limited = [duration for duration in durations if 0 < duration.nanoseconds < Infinite.nanoseconds]
+    return max(limited, key=lambda duration: duration.nanoseconds) if len(limited) == len(durations) else None
+
+
+def message_class(type_name: str) -> type:
+    """The Python class of a type like sensor_msgs/msg/LaserScan. Raises UserError if it is not installed here."""
+    package, _, name = type_name.partition("/msg/")
+    try:
+        found: type = getattr(importlib.import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError):
+        raise UserError(
+            f"the type {type_name} is not installed here: install the package {package}, and source its workspace"
+        ) from None
+    return found

@@ -306,6 +306,8 @@ class LoopNode(Node, Generic[P]):
     def _on_set_parameters(self, parameters: list[RosParameter[Any]]) -> SetParametersResult:
         known = parameters_of(type(self.settings))
         changed = {p.name: p.value for p in parameters if p.name in known}
+        if not changed:  # rclpy's own, as those of QoS, also while the node is being made
+            return SetParametersResult(successful=True)
         try:
             settings = build(type(self.settings), as_dict(self.settings) | changed, self.get_name())
         except ParameterError as error:
@@ -335,7 +337,7 @@ def _declare(node: Node, schema: type[P]) -> P:
     """Declare a schema's parameters and read their values. Raises ParameterError."""
     values = {}
     for name, parameter in parameters_of(schema).items():
-        default = list(parameter.default) if parameter.kind == "double_array" else parameter.default
+        default = list(parameter.default) if parameter.kind.endswith("_array") else parameter.default
         try:
             values[name] = node.declare_parameter(name, default, _descriptor(parameter)).value
         except InvalidParameterTypeException as error:

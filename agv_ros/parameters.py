@@ -27,7 +27,7 @@ class Parameter:
     """What is known of one parameter, apart from its value."""
 
     name: str
-    kind: str  # "double", "integer", "string", "bool" or "double_array", as ROS names them
+    kind: str  # "double", "integer", "string", "bool", "double_array" or "string_array", as ROS names them
     default: Any
     unit: str
     description: str
@@ -49,6 +49,8 @@ class Parameter:
         """What values are allowed, in words: `in [0, 1]`, `one of hold, align`."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
+        if self.kind == "string_array":
+            return "one or more strings"
         if self.kind not in ("double", "integer"):
             return f"{self._count} finite numbers" if self.kind == "double_array" else f"a {self.kind}"
         if self.above is not None and self.high is None:
@@ -80,9 +82,16 @@ class Parameter:
             if self.choices and value not in self.choices:
                 remedy = f": {self.remedy}" if self.remedy else ""
                 raise ParameterError(f"{where} must be {self.allowed}, got {value!r}{remedy}")
+        elif self.kind == "string_array":
+            return self._check_strings(where, value)
         else:
             return self._check_array(where, value)
         return value
+
+    def _check_strings(self, where: str, value: object) -> tuple[str, ...]:
+        if not isinstance(value, list | tuple) or not value or not all(isinstance(item, str) for item in value):
+            raise ParameterError(f"{where} is a list of {self.allowed}, got {value!r}")
+        return tuple(value)
 
     def _check_number(self, where: str, value: float) -> None:
         fits = (
@@ -123,7 +132,8 @@ def parameter(
     """Dataclass field for one parameter.
 
     `low` and `high` are included, `above` is not; a double is finite unless `high` is inf. A `runtime` parameter can be
-    changed while the node runs. A tuple default makes a double_array of that length, or of any but 0. `remedy` says
+    changed while the node runs. A tuple default makes a double_array of that length, or of any but 0, or, of strings, a
+    string_array; ROS has no empty ones. `remedy` says
     what to do where none of the `choices` is meant; they are a function where others may be added in a running process.
     """
     known = {
@@ -165,6 +175,13 @@ def _prefix(field: dataclasses.Field[Any]) -> str:
 _KINDS = {bool: "bool", int: "integer", float: "double", str: "string", tuple: "double_array"}
 
 
+def _kind_of(default: Any) -> str:
+    """ROS' name for the type of a default."""
+    if isinstance(default, tuple) and isinstance(default[0], str):
+        return "string_array"
+    return _KINDS[type(default)]
+
+
 class KnownParameters(dict[str, Parameter]):
     """Parameters by their full (dotted) names, in the order of declaration; not to be changed."""
 
@@ -196,7 +213,7 @@ def _parameters_of(schema: type) -> KnownParameters:
         length = len(field.default) if isinstance(field.default, tuple) and not free else None
         found[field.name] = Parameter(
             name=field.name,
-            kind=_KINDS[type(field.default)],
+            kind=_kind_of(field.default),
             default=field.default,
             length=length,
             choices=choices() if callable(choices) else choices,

@@ -126,11 +126,10 @@ def _keys(of: Any, above: str = "") -> Iterator[str]:
 
 
 def _parameters() -> Iterator[tuple[str, str]]:
-    from agv_analysis.runtime.parameters import RecorderParameters
-    from agv_analysis.scenario import SCHEMAS
+    from agv_analysis.runtime.node_help import NODE_SCHEMAS
     from agv_ros.parameters import parameters_of
 
-    for node, schema in {**SCHEMAS, "recorder": RecorderParameters}.items():
+    for node, schema in NODE_SCHEMAS.items():
         for name, known in parameters_of(schema).items():
             yield f"{node}.{name}", f"{known.kind} [{known.unit}] {known.default!r}"
 

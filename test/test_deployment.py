@@ -20,7 +20,7 @@ from agv_analysis.cli import main
 from agv_analysis.doctor.extras import requirements
 from agv_analysis.doctor.network import ports
 from agv_analysis.runtime.executables import NODE_MODULES
-from agv_analysis.runtime.parameters import RecorderParameters
+from agv_analysis.runtime.node_help import NODE_SCHEMAS
 from agv_analysis.scenario import SCHEMAS
 from agv_ros.parameters import parameters_of
 
@@ -43,7 +43,7 @@ def check_command(words: list[str]) -> None:
     assert command is not None, words
     command.make_context(words[0], [*words[1:]])
     if words[0] == "node":
-        known = parameters_of({**SCHEMAS, "recorder": RecorderParameters}[words[1]])
+        known = parameters_of(NODE_SCHEMAS[words[1]])
         given = [word.partition(":=")[0] for word in words if ":=" in word]
         assert [name for name in given if name not in known] == []
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
-EXECUTABLES = ("plant", "relay", "error_detector", "controller", "recorder")
+EXECUTABLES = ("plant", "relay", "error_detector", "controller", "recorder", "link_emulator")
 
 # Another environment's Python that is started from one of the ROS wheels' must set itself up anew.
 ENVIRONMENT = {name: value for name, value in os.environ.items() if name != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}

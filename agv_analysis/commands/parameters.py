@@ -16,14 +16,13 @@ def command() -> None:
 
 def markdown() -> str:
     """The parameters of all nodes as tables in Markdown, one for each node and for each part that it may choose."""
-    from agv_analysis.runtime.parameters import RecorderParameters
-    from agv_analysis.scenario import PART_CHOICES, SCHEMAS
+    from agv_analysis.runtime.node_help import NODE_SCHEMAS
+    from agv_analysis.scenario import PART_CHOICES
     from agv_ros.parameters import SHARED, parameters_of
 
-    schemas = {**SCHEMAS, "recorder": RecorderParameters}
-    shared = [parameters_of(schemas["plant"])[name] for name in SHARED]
+    shared = [parameters_of(NODE_SCHEMAS["plant"])[name] for name in SHARED]
     text = _table("All nodes", shared)
-    for node, schema in schemas.items():
+    for node, schema in NODE_SCHEMAS.items():
         known, tables = parameters_of(schema), {}
         if node in PART_CHOICES:
             choice = PART_CHOICES[node]

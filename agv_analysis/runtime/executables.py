@@ -13,6 +13,7 @@ NODE_MODULES = {
     "error_detector": "agv_cloud.error_detector_node",
     "controller": "agv_cloud.controller_node",
     "recorder": "agv_analysis.runtime.recorder_node",
+    "link_emulator": "agv_plant.link_emulator_node",
 }
 """The module of each node; each has a `main` that takes its arguments."""
 
@@ -63,3 +64,8 @@ def controller() -> None:
 def recorder() -> None:
     """Entry point of the executable `recorder`."""
     _executable("recorder")
+
+
+def link_emulator() -> None:
+    """Entry point of the executable `link_emulator`."""
+    _executable("link_emulator")

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import SCHEMAS
+from agv_plant.emulator_parameters import LinkEmulatorParameters
 from agv_ros.parameters import parameters_of
 
 
@@ -51,9 +52,14 @@ ABOUT = {
          f"edge/cmd_vel {_COMMAND}", f"agv/cmd_vel {_COMMAND}", f"agv/slot {_SLOT}", _DIAGNOSTICS),
         (_DIAGNOSTICS,),
     ),
+    "link_emulator": About(
+        "A radio link for topics of any type: loses, delays or doubles their messages, reproducibly.",
+        (),
+        (f"uplink/verdict {_SLOT}", f"downlink/verdict {_SLOT}", _DIAGNOSTICS),
+    ),
 }  # fmt: skip
 
-NODE_SCHEMAS: dict[str, type] = {**SCHEMAS, "recorder": RecorderParameters}
+NODE_SCHEMAS: dict[str, type] = {**SCHEMAS, "recorder": RecorderParameters, "link_emulator": LinkEmulatorParameters}
 """All executables, with the schema of their parameters."""
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import heapq
-import math
 from typing import NamedTuple
 
-from agv_plant.channels.model import GOOD
 from agv_plant.channels.position_dependent import NOWHERE
-from agv_plant.radio.channel import Channel, SlotOutcome
-from agv_plant.radio.delay import EXPIRED, soonest, whole_slots
+from agv_plant.radio.channel import Channel
+from agv_plant.radio.delay import soonest, whole_slots
+from agv_plant.radio.link_counts import LinkCounts
 from agv_ros.messages import DELAYED, DELIVERED, LOST, Slot
 from agv_ros.stamps import MAX_LEAP, Grid, NearestSteps, Steps
 
@@ -21,7 +20,7 @@ class Passage(NamedTuple):
     arrived: list[bytes]
 
 
-class Link:
+class Link(LinkCounts):
     """A channel with the messages under way in it, the memory of the receiver behind it, and a count of what happened.
 
     Theory of operation. A slot is taken by the message of its step. What is not lost joins those under way, once or
@@ -32,6 +31,7 @@ class Link:
     """
 
     def __init__(self, channel: Channel, grid: Grid, keeps_to_grid: bool = True, window: int = MAX_LEAP) -> None:
+        super().__init__()
         self.channel = channel
         self._steps = Steps(grid, window) if keeps_to_grid else NearestSteps(grid.ts_ns)
         self._freshest_ns = 0
@@ -39,17 +39,6 @@ class Link:
         self._sent_ns = -1
         self._under_way: list[tuple[int, float, int, int, bytes]] = []
         self._order = 0
-        self.sent = 0
-        self.lost = 0
-        self.longest = 0
-        """Most messages lost in a row."""
-        self.delayed = 0
-        """Messages that came, or will come, in a later slot than their own."""
-        self.copies = 0
-        """Messages that came, or will come, a second time."""
-        self.expired = 0
-        """Messages of those lost that would have come too old."""
-        self._run = 0
 
     def transmit(self, stamp_ns: int, message: bytes = b"", place: tuple[float, float] = NOWHERE) -> Passage:
         """The slot of the message with this stamp, sent when the AGV is at `place` [m].
@@ -61,7 +50,7 @@ class Link:
             self._freshest_ns, self._freshest, self._under_way = 0, [], []
         outcome = self.channel.outcome(k, *place)
         wait = 0 if outcome.lost else self._send(k, stamp_ns, message)
-        self._count(outcome, wait)
+        self.count(outcome, wait > 0)
         arrived = []
         while self._under_way and self._under_way[0][0] <= k:
             *_, sent_ns, data = heapq.heappop(self._under_way)
@@ -72,7 +61,8 @@ class Link:
         if is_again and not arrived:
             arrived = [*self._freshest]
         word = LOST if outcome.lost else DELAYED if wait else DELIVERED
-        return Passage(Slot(stamp_ns, self._freshest_ns, word, self._note(outcome, wait)), arrived)
+        note = self.note(outcome, *([f"delay={wait}"] if wait else []))
+        return Passage(Slot(stamp_ns, self._freshest_ns, word, note), arrived)
 
     def _send(self, k: int, stamp_ns: int, message: bytes) -> int:
         """Put a message, and its copy if there is one, under way; returns the slots until the first of them arrives."""
@@ -84,18 +74,3 @@ class Link:
                 self._order += 1
         self.copies += first >= 0.0 and copy >= 0.0
         return soonest(first, copy)
-
-    def _count(self, outcome: SlotOutcome, wait: int) -> None:
-        self.sent += 1
-        self.lost += outcome.lost
-        self.expired += outcome.cause == EXPIRED
-        self.delayed += wait > 0
-        self._run = self._run + 1 if outcome.lost else 0
-        self.longest = max(self.longest, self._run)
-
-    def _note(self, outcome: SlotOutcome, wait: int) -> str:
-        facts = [f"cause={outcome.cause}", f"run={self._run}"] if outcome.lost else []
-        facts += [f"delay={wait}"] if wait else []
-        facts += [f"state={outcome.state}"] if outcome.state != GOOD else []
-        facts += [] if math.isnan(outcome.gain) else [f"gain={outcome.gain:.2f}"]
-        return " ".join(facts)
