@@ -8,7 +8,6 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from copy import copy
 from typing import Any, Generic, TypeVar
 
 import rclpy
@@ -23,14 +22,14 @@ from rclpy.exceptions import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
 from agv_ros.codec import encode_diagnostics
-from agv_ros.endpoints import LOOP_QOS, Output
+from agv_ros.endpoints import Output
 from agv_ros.errors import UserError
 from agv_ros.messages import CHANGED, PUBLISHED
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
+from agv_ros.qos import Input, create_publisher
 from agv_ros.stamps import LATEST_NS, Grid
 
 P = TypeVar("P", bound=LoopParameters)
@@ -43,6 +42,9 @@ _PATIENCE = 3.0
 
 _LOOK_PERIOD = 1.0
 """How often [s] a node looks for others that publish its topics."""
+
+_OFFERS_PERIOD = 0.25
+"""How often [s] it looks what is offered to its inputs."""
 
 _ACK_PERIOD = 0.1
 """For how long [s] at a time a node waits until its subscribers have acknowledged what it has sent."""
@@ -82,6 +84,7 @@ class LoopNode(Node, Generic[P]):
         self.sides: list[Node] = []
         """This node's participants in other DDS domains; to be spun with it."""
         self._diagnostics = self.output(DiagnosticArray, "/diagnostics", side=True)
+        self._inputs: list[Input] = []
         self._unheard: dict[str, tuple[Output, ...]] = {}
         """Inputs that are not subscribed to yet, with the outputs that too few listen to."""
         self._tell_of_waiting_at = math.inf
@@ -89,6 +92,7 @@ class LoopNode(Node, Generic[P]):
         """Other publishers of this node's topics, as they were seen, by topic."""
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self.create_timer(_LOOK_PERIOD, self._look_for_rivals, clock=self._steady)
+        self.create_timer(_OFFERS_PERIOD, self._look_at_offers, clock=self._steady)
 
     # -- domains -----------------------------------------------------------------------------------------------------
 
@@ -125,9 +129,7 @@ class LoopNode(Node, Generic[P]):
 
         To an `optional` topic one of ours listens, but maybe not another's in its place. `on` is this node `in_domain`.
         """
-        publisher = (on or self).create_publisher(
-            kind, topic, copy(LOOP_QOS), qos_overriding_options=QoSOverridingOptions.with_default_policies()
-        )
+        publisher = create_publisher(on or self, kind, topic, self.get_logger().warning)
         self.outputs.append(Output(publisher, side, optional, on or self))
         return self.outputs[-1]
 
@@ -156,10 +158,7 @@ class LoopNode(Node, Generic[P]):
             if not all(output.is_heard(wanted) for output in feeds):
                 return False
             del self._unheard[topic]
-            where.create_subscription(
-                kind, topic, receive, copy(LOOP_QOS), raw=True,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )  # fmt: skip
+            self._inputs.append(Input(where, kind, topic, receive, self.get_logger().warning))
             return True
 
         self.poll(subscribe_when_heard)
@@ -221,6 +220,10 @@ class LoopNode(Node, Generic[P]):
                     return
 
     # -- what went wrong ---------------------------------------------------------------------------------------------
+
+    def _look_at_offers(self) -> None:
+        for one in self._inputs:
+            one.look()
 
     def _look_for_rivals(self) -> None:
         """Name, once each, other nodes that publish this node's topics: what they send counts as this loop's."""
@@ -290,6 +293,9 @@ class LoopNode(Node, Generic[P]):
         facts |= self._changes
         facts |= {f"rejected {topic}": str(count) for topic, count in sorted(self.rejected.items())}
         facts |= {f"other publishers {topic}": names for topic, names in self._rivals.items()}
+        facts |= {
+            f"missed deadlines {one.topic}": str(one.missed_deadlines) for one in self._inputs if one.missed_deadlines
+        }
         facts |= {f"errors {kind}": str(count) for kind, count in sorted(self.survived.items())}
         if self._ended:
             facts |= {ENDED: "true"}

@@ -18,9 +18,12 @@ rclpy = pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import TimeReference
 from trajectory_msgs.msg import MultiDOFJointTrajectory
@@ -210,6 +213,57 @@ def test_qos_can_be_overridden(bench: Bench) -> None:
     bench.until(lambda: bench.probe.count_publishers("edge/pose") == 1)  # another topic of the same process
     info = bench.probe.get_publishers_info_by_topic("edge/pose")[0]
     assert info.qos_profile.reliability.short_key == "reliable"
+
+
+def test_best_effort_sensors_are_heard_whenever_they_come(bench: Bench) -> None:
+    """Odometry as drivers publish it, by SensorDataQoS; before the edge was there, and after it."""
+    first = bench.probe.create_publisher(Odometry, "edge/pose", qos_profile_sensor_data)
+    parameters: dict[str, Any] = {"trigger": "timer", "ts": 0.02, "track": "line", "pose_type": "odometry"}
+    bench.add(ErrorDetectorNode, begin="first_pose", **parameters)
+    bench.until(lambda: first.get_subscription_count() == 1)
+    errors = bench.received(Odometry, "edge/error")
+    odometry = Odometry()
+    odometry.header.stamp.sec, odometry.pose.pose.orientation.w = 1, 1.0
+    first.publish(odometry)
+    bench.until(lambda: len(errors) > 3)
+    controller = bench.add(ControllerNode)
+    later = bench.probe.create_publisher(Odometry, "edge/error", qos_profile_sensor_data)
+    bench.until(lambda: later.get_subscription_count() == 1)
+    assert controller.rejected == {}
+
+
+def test_an_offer_that_does_not_fit_is_said_once_with_the_parameter_that_mends_it(bench: Bench) -> None:
+    deadline = {"qos_overrides./edge/error.subscription.deadline": 100_000_000}
+    bench.add(ControllerNode, **{name.replace(".", "__"): value for name, value in deadline.items()})
+    logged: list[Any] = []
+    bench.probe.create_subscription(Log, "/rosout", logged.append, 100)
+    bench.probe.create_publisher(Odometry, "edge/error", LOOP_QOS)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    for _ in range(2):
+        bench.probe.create_subscription(TwistStamped, "edge/cmd_vel", lambda _: None, latched)
+
+    def said(words: str) -> list[str]:
+        return [entry.msg for entry in logged if entry.name == "controller" and words in entry.msg]
+
+    bench.until(lambda: len(said("/edge/error: ")) == 1 and len(said("/edge/cmd_vel: ")) == 1)
+    assert said("/edge/error: ")[0].endswith("set the parameter qos_overrides./edge/error.subscription.deadline to 0")
+    assert "qos_overrides./edge/cmd_vel.publisher.durability to what it asks for" in said("/edge/cmd_vel: ")[0]
+
+
+def test_missed_deadlines_are_counted(bench: Bench) -> None:
+    deadline = {"qos_overrides./edge/error.subscription.deadline": 20_000_000}
+    controller = bench.add(ControllerNode, **{name.replace(".", "__"): value for name, value in deadline.items()})
+    often = QoSProfile(depth=1, deadline=Duration(nanoseconds=20_000_000))
+    publisher = bench.probe.create_publisher(Odometry, "edge/error", often)
+    bench.until(lambda: publisher.get_subscription_count() == 1)
+    publisher.publish(Odometry())
+    bench.until(lambda: controller._inputs[0].missed_deadlines > 2)
+
+
+def test_a_policy_that_there_is_not_is_refused(lone_bench: Bench) -> None:
+    wrong = {"qos_overrides./edge/error.subscription.reliability": "perhaps"}
+    with pytest.raises(UserError, match=r"/edge/error: Unexpected QoS override for policy `reliability`: `perhaps`"):
+        lone_bench.add(ControllerNode, **{name.replace(".", "__"): value for name, value in wrong.items()})
 
 
 # -- messages ---------------------------------------------------------------------------------------------------------
@@ -765,8 +819,6 @@ def test_a_node_that_is_started_again_in_an_outage_goes_on_with_the_pose_before_
 def test_a_node_that_cannot_start_says_so_in_one_line_and_on_rosout(
     start: Start, lone_bench: Bench, arguments: tuple[str, ...], said: str
 ) -> None:
-    from rcl_interfaces.msg import Log
-
     logged: list[Any] = []
     lone_bench.probe.create_subscription(Log, "/rosout", logged.append, 10)
     node = start("agv_cloud.controller_node", "--ros-args", *arguments)
