@@ -40,10 +40,11 @@ class DirectionParameters(ChannelParameters):
     def __post_init__(self) -> None:
         """Check what no single bound can say."""
         super().__post_init__()
-        if self.schedule and not self.period:
+        if (self.schedule or self.reliable) and not self.period:
+            what = "has a schedule" if self.schedule else "is reliable"
             raise ParameterError(
-                "a direction has a schedule, whose times say nothing where each message takes the next slot: set its "
-                "period, the length of a slot"
+                f"a direction {what}, whose times say nothing where each message takes the next slot: set its period, "
+                "the length of a slot"
             )
         for name in filter(None, self.topics):
             heard, arrow, called = name.partition(_ARROW)

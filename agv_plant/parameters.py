@@ -239,6 +239,19 @@ class ChannelParameters:
         math.inf, "a message that would come older than this never comes, .inf: all come", unit="s", above=0.0,
         high=math.inf, runtime=True,
     )  # fmt: skip
+    reliable: bool = parameter(
+        False,
+        "true: as reliable DDS, which sends again what was lost and keeps the order: losses become late bursts",
+    )
+    resend_after: float = parameter(
+        0.01,
+        "reliable: time from the first message that comes through after an outage until the missing ones have come",
+        unit="s", low=0.0, high=10.0,
+    )  # fmt: skip
+    history: int = parameter(
+        0, "reliable: how many messages the sender keeps; older ones of an outage are lost for good; 0: all of them",
+        low=0, high=4096,
+    )  # fmt: skip
     schedule: str = parameter(
         "",
         "what changes in a run, as in '20: p=0.1; 20: outage=0.3 every 5; 60: outage=0': from 20 s on p is 0.1 and all "
@@ -260,7 +273,21 @@ class ChannelParameters:
             raise ParameterError(
                 f"a channel's vehicle is {self.vehicle}, must be 0 to {self.vehicles - 1}: see vehicles"
             )
+        if self.reliable:
+            self._refuse_with_reliable()
         _ = self.entries
+
+    def _refuse_with_reliable(self) -> None:
+        """Raise ParameterError for what cannot be, where all comes once and in order, or cannot be known ahead."""
+        if self.jitter > 0.0 or self.duplicate > 0.0 or any(e.name in ("jitter", "duplicate") for e in self.entries):
+            raise ParameterError("a channel is reliable, so all comes once and in order: set jitter and duplicate to 0")
+        if self.is_placed:
+            raise ParameterError(
+                f"a channel is reliable, and its model {self.model} asks where the AGV is when it sends again, which "
+                "cannot be known: choose another model"
+            )
+        if self.model == TRACE and has_delays(self.trace_file):
+            raise ParameterError("a channel is reliable, but its trace has delays already: set reliable to false")
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -282,7 +309,8 @@ class ChannelParameters:
         """May a message arrive later than in its slot? Raises TraceError for a trace that cannot be read."""
         of_parameters = self.delay + self.jitter > 0.0
         of_schedule = any(entry.name in ("delay", "jitter") for entry in self.entries)
-        return of_parameters or of_schedule or (self.model == TRACE and has_delays(self.trace_file))
+        of_trace = self.model == TRACE and has_delays(self.trace_file)
+        return self.reliable or of_parameters or of_schedule or of_trace
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,7 @@ _SHOWN = {
 }  # fmt: skip
 """The parameters that say what a model does."""
 
-_ON_TOP = ("delay", "jitter", "duplicate", "schedule")
+_ON_TOP = ("delay", "jitter", "duplicate", "schedule", "reliable")
 """Those that say what comes on top of it, unless they are empty."""
 
 _AGES = (1, 2, 5, 10, 20, 50, 100)

@@ -112,9 +112,9 @@ def chain_of(channel: ChannelParameters) -> Chain | None:
     """The chain of a channel's parameters; None for a model that is no Markov chain of at most `MOST_STATES` states.
 
     A single outage (burst with a start_step) is over some day: to the long run the channel is perfect. What a schedule
-    changes is no chain.
+    changes is no chain, nor what is sent again.
     """
-    if channel.schedule:
+    if channel.schedule or channel.reliable:
         return None
     if channel.model == "perfect" or (channel.model == "burst" and channel.start_step >= 0):
         return bernoulli(0.0)
@@ -131,6 +131,8 @@ def why_no_chain(channel: ChannelParameters) -> str:
     """What keeps a channel from being a chain, as the end of a sentence about it."""
     if channel.schedule:
         return "is changed by its schedule"
+    if channel.reliable:
+        return "is reliable, so that its losses are late bursts"
     return f"has more than {MOST_STATES} states" if channel.model == "burst" else "is no finite Markov chain"
 
 

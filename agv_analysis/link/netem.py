@@ -23,7 +23,7 @@ class NetemError(UserError):
 
 def to_netem(channel: ChannelParameters) -> str:
     """What follows `tc qdisc ... netem` for this channel. Raises NetemError for what netem does not have."""
-    for name, usual in (("schedule", ""), ("lifetime", math.inf)):
+    for name, usual in (("schedule", ""), ("lifetime", math.inf), ("reliable", False)):
         if getattr(channel, name) != usual:
             raise NetemError(f"netem has no {name}; the channel's is {getattr(channel, name)}")
     clauses = [*_delay(channel), *_loss(channel), *_duplicate(channel)]

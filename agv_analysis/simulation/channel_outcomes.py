@@ -22,9 +22,10 @@ from agv_plant.channels.model import GOOD
 from agv_plant.channels.position_dependent import kind_of
 from agv_plant.channels.registry import MODELS, SHARED, TRACE, find_model
 from agv_plant.parameters import ChannelParameters
-from agv_plant.radio.channel import Channel, MeasuredSlots, delay_draws, draws, own_stream
+from agv_plant.radio.channel import Channel, MeasuredSlots, delay_draws, draws, on_air, own_stream
 from agv_plant.radio.channel_setup import Segment, levels_of, segments_of, spatial_table_of
-from agv_plant.radio.delay import NEVER, delays_of, soonest
+from agv_plant.radio.delay import NEVER, delays_of, soonest, whole_slots
+from agv_plant.radio.retransmission import AHEAD, GIVEN_UP, waits_of
 from agv_plant.radio.schedule import is_scripted
 from agv_plant.radio.shared_uplink import SCHEDULERS, serve_all, stream_of
 from agv_plant.random_stream import uniforms
@@ -74,7 +75,10 @@ class ChannelRealisation:
         """Outcomes, and into `states` the states that decided."""
         states = np.empty(self._steps, dtype=np.int64) if states is None else states
         lost = np.zeros(self._steps, dtype=np.bool_)
-        if channel.model == TRACE:
+        if channel.reliable:
+            lost[:] = waits_for_others(channel, self._seed, stream, self._steps, self._ts) == GIVEN_UP
+            states[:] = _below(channel, self._seed, stream, self._steps, self._ts)[1][: self._steps]
+        elif channel.model == TRACE:
             lost[:] = MeasuredSlots(channel, self._seed, stream, self._ts).rows(0, self._steps)[:, 0]
         elif channel.model == SHARED:
             self._serve(channel, stream, lost)
@@ -87,7 +91,7 @@ class ChannelRealisation:
                 # Another package's model may be more than numba compiles: slot by slot it is the same, or says why not.
                 return _one_by_one(Channel(channel, self._seed, stream, self._ts), states)
         for segment, end in _segments(channel, self._steps, self._ts):
-            if segment.outage.length > 0.0:
+            if segment.outage.length > 0.0 and not channel.reliable:
                 compiled(_script)(lost, segment.first, end, *segment.outage, self._ts)
             if segment.channel.lifetime < math.inf:
                 lost[segment.first : end] |= _slots_under_way(segment, end, self._seed, stream, self._ts) == NEVER
@@ -145,12 +149,28 @@ def _slots_under_way(segment: Segment, end: int, seed: int, stream: str, ts: flo
     now, count = segment.channel, end - segment.first
     random = delay_draws(now, seed, stream, segment.first, count)
     delay = np.full(count, now.delay)
+    if now.reliable:
+        waits = waits_for_others(now, seed, stream, end, ts)
+        delay += np.maximum(0, waits[segment.first :]) * ts
     if now.model == TRACE:
         delay += MeasuredSlots(now, seed, stream, ts).rows(segment.first, count)[:, 1]
     found: NDArray[np.int64] = compiled(_waits)(
         numbers(random), segment.first, numbers(delay), now.jitter, now.duplicate, now.lifetime, ts
     )
     return found
+
+
+@functools.lru_cache(maxsize=16)
+def waits_for_others(channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> NDArray[np.int64]:
+    """Slots that messages of a reliable channel wait for others that are sent again, GIVEN_UP if lost; shape (N,)."""
+    lost = _below(channel, seed, stream, steps, ts)[0]
+    return waits_of(lost, whole_slots(channel.resend_after / ts), channel.history)
+
+
+@functools.lru_cache(maxsize=16)
+def _below(channel: ChannelParameters, seed: int, stream: str, steps: int, ts: float) -> tuple[Outcomes, States]:
+    """Outcomes and states of the channel below a reliable one, for as long as anything is sent again."""
+    return ChannelRealisation(seed, steps + AHEAD, ts).outcomes_and_states(on_air(channel), stream)
 
 
 def _segments(channel: ChannelParameters, steps: int, ts: float) -> list[tuple[Segment, int]]:

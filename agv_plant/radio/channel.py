@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -18,7 +19,8 @@ from agv_plant.channels.timed_trace import Trace, read_trace, start_of
 from agv_plant.channels.trace import TraceError
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel_setup import UPLINK, Segment, levels_of, segments_of, spatial_table_of
-from agv_plant.radio.delay import EXPIRED, delays_of
+from agv_plant.radio.delay import EXPIRED, delays_of, whole_slots
+from agv_plant.radio.retransmission import GIVEN_UP, Retransmission
 from agv_plant.radio.schedule import OUTAGE, is_scripted
 from agv_plant.radio.shared_uplink import SCHEDULERS, serve, stream_of
 from agv_plant.random_stream import InBlocks, uniforms
@@ -57,6 +59,11 @@ def draws(parameters: ChannelParameters, seed: int, stream: str, first: int, cou
 def delay_draws(parameters: ChannelParameters, seed: int, stream: str, first: int, count: int) -> NDArray[np.float64]:
     """The same for delays, those of a link alone."""
     return uniforms(seed, f"{own_stream(parameters, stream)}/delay", first, count)
+
+
+def on_air(parameters: ChannelParameters) -> ChannelParameters:
+    """The channel below a reliable one: what is lost before it is sent again."""
+    return dataclasses.replace(parameters, reliable=False, delay=0.0, lifetime=math.inf)
 
 
 class SlotOutcome(NamedTuple):
@@ -136,6 +143,8 @@ class Channel:
 
     def __init__(self, parameters: ChannelParameters, seed: int, stream: str, ts: float = LoopParameters.ts) -> None:
         self._ts = ts
+        self._on_air = Channel(on_air(parameters), seed, stream, ts) if parameters.reliable else None
+        """What is lost before it is sent again, of a reliable channel."""
         self.parameters = parameters
         measured = parameters.model == TRACE
         self._kind = kind_of(parameters.model)
@@ -145,6 +154,8 @@ class Channel:
         self._model = None if measured or parameters.is_placed else _model_of(parameters, seed, stream)
         self._random = _in_blocks(lambda first, count: draws(self.parameters, seed, stream, first, count))
         self._random_delays = _in_blocks(lambda first, count: delay_draws(self.parameters, seed, stream, first, count))
+        self._again = Retransmission(self._is_lost_on_air)
+        self._causes: dict[int, SlotOutcome] = {}
         self._next = 0
         self._state = GOOD
         self._last = SlotOutcome(False)
@@ -159,6 +170,8 @@ class Channel:
         self._parameters = parameters
         self._segments = segments_of(parameters, self._ts)
         self._firsts = [segment.first for segment in self._segments]
+        if self._on_air is not None:
+            self._on_air.parameters = on_air(parameters)
         self._may_expire = any(segment.channel.lifetime < math.inf for segment in self._segments)
         self._has_outages = any(segment.outage.length > 0.0 for segment in self._segments)
 
@@ -168,10 +181,13 @@ class Channel:
 
     def outcome(self, k: int, x: float = NOWHERE[0], y: float = NOWHERE[1]) -> SlotOutcome:
         """The outcome of slot `k`. Slot 0 is never lost: a run begins with the AGV known to the edge."""
-        outcome = self._by_place(k, x, y) if self._kind else self._by_slot(k)
+        if self._on_air is not None:
+            outcome = self._sent_again(k)
+        else:
+            outcome = self._by_place(k, x, y) if self._kind else self._by_slot(k)
         if k == 0:
             return outcome._replace(lost=False, cause="")
-        if self._has_outages and is_scripted(k, *self._segment(k).outage, self._ts):
+        if self._on_air is None and self._has_outages and is_scripted(k, *self._segment(k).outage, self._ts):
             return outcome._replace(lost=True, cause=OUTAGE)
         if self._may_expire and max(self.delays(k)) < 0.0:
             return outcome._replace(lost=True, cause=EXPIRED)
@@ -181,10 +197,29 @@ class Channel:
         """Slots that the message of slot `k` is under way if it is not lost, and its copy; -1 for what never comes."""
         c = self._segment(k).channel
         delay = c.delay + (self._measured_at(k)[1] if self._slots is not None else 0.0)
+        if self._on_air is not None:
+            delay += max(0, self._wait_again(k)) * self._ts
         if delay + c.jitter + c.duplicate == 0.0:
             return 0.0, -1.0
         u_delay, u_twice, u_copy, _ = self._random_delays.at(k)
         return delays_of(k, u_delay, u_twice, u_copy, delay, c.jitter, c.duplicate, c.lifetime, self._ts)
+
+    def _wait_again(self, k: int) -> int:
+        """Slots that the message of slot `k` waits for others that are sent again, GIVEN_UP if it never comes."""
+        c = self._parameters
+        return self._again.wait(k, whole_slots(c.resend_after / self._ts), c.history)
+
+    def _sent_again(self, k: int) -> SlotOutcome:
+        assert self._on_air is not None
+        wait = self._wait_again(k)
+        found = self._causes[k] if k in self._causes else self._on_air.outcome(k)
+        self._causes = {j: outcome for j, outcome in self._causes.items() if j >= k}
+        return found if wait == GIVEN_UP else found._replace(lost=False, cause="")
+
+    def _is_lost_on_air(self, k: int) -> bool:
+        assert self._on_air is not None
+        self._causes[k] = self._on_air.outcome(k)
+        return self._causes[k].lost
 
     def _segment(self, k: int) -> Segment:
         if len(self._segments) == 1:
