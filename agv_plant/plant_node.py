@@ -136,8 +136,8 @@ class PlantNode(LoopNode[PlantParameters]):
         few = next(output.topic for output in self.outputs if not output.is_heard(wanted))
         missing = self._silent() or ("recorder" if wanted > 1 else "relay")
         return (
-            f"the loop has not begun within {self.settings.start_timeout:g} s: {few} has fewer than {wanted} "
-            f"listeners, as wait_for_subscribers asks for: is the {missing} running?"
+            f"the loop has not begun within {self.settings.start_timeout:g} s: {few} has fewer listeners "
+            f"than it waits for ({wanted}): is the {missing} running?"
         )
 
     # -- the loop ----------------------------------------------------------------------------------------------------

@@ -748,8 +748,8 @@ def test_lockstep_names_the_missing_peer(start: Start, two_domains: tuple[int, i
         status, said = plant.end()
         assert status == 1
         assert said.splitlines()[-1] == (
-            "the loop has not begun within 4 s: /agv/pose has fewer than 1 listeners, as wait_for_subscribers asks "
-            f"for: is the {silent} running?"
+            "the loop has not begun within 4 s: /agv/pose has fewer listeners than it waits for (1): "
+            f"is the {silent} running?"
         )
         assert "Traceback" not in said
 
