@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := bags/demo
+PROSE := README.md CONTRIBUTING.md SECURITY.md QUALITY_DECLARATION.md CHANGELOG.md $(filter-out docs/style.md,$(wildcard docs/*.md))
 
 # Many tests wait, for processes to start and for DDS, so cores have time for more of them.
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(max(1, 3 * len(os.sched_getaffinity(0)) // 2))')
@@ -20,10 +21,12 @@ demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analy
 	$(BIN)/agv-ncs run config/outages.yaml --bag $(DEMO)
 	$(BIN)/agv-ncs analyse $(DEMO) --json $(DEMO)/analysis.json --report $(DEMO)/report.html
 
-test: $(VENV)/test.stamp ## style, types and tests
+test: $(VENV)/test.stamp ## style, types, prose and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
+	$(BIN)/proselint --config .proselintrc.json check $(PROSE)
 	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n $(WORKERS) --dist worksteal $(PYTEST_ARGS)
 
 coverage: PYTEST_ARGS += --cov --cov-report=term ## the same with coverage, which takes longer

@@ -31,7 +31,7 @@ def refuse_irregular(path: str | os.PathLike[str]) -> None:
     """Raise IrregularFileError if there is something at `path` that is neither a file nor a directory."""
     try:
         mode = Path(path).stat().st_mode
-    except (OSError, ValueError):  # whoever opens it says so
+    except (OSError, ValueError):  # opening it says so
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise IrregularFileError(path)

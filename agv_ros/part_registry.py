@@ -1,7 +1,7 @@
 """Registries: functions of one kind by name, of this package, of other installed ones, and of this process alone.
 
-What goes wrong in another package's function is one line that names it and the reason. One that cannot be used disturbs
-nobody until it is chosen.
+What goes wrong in another package's function is one line that names it and the reason. One that cannot be used has
+no effect until it is chosen.
 """
 
 from __future__ import annotations

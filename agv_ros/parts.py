@@ -12,7 +12,7 @@ Nodes call the adapter; the simulation compiles it in place of the default one. 
 arguments are in range, so that a wrong part ends a run, compiled or not, instead of spoiling it.
 
 What goes wrong in another package's part is one line that names the part and the reason. A part that cannot be used
-disturbs nobody until it is chosen.
+has no effect until it is chosen.
 """
 
 from __future__ import annotations

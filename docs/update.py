@@ -67,7 +67,7 @@ def stability_page() -> str:
     """docs/stability.md with its table of criteria made anew."""
     from agv_analysis.stability.criteria import CRITERIA
 
-    rows = ["| key | asks | takes for granted |", "| --- | --- | --- |"]
+    rows = ["| key | asks | assumes |", "| --- | --- | --- |"]
     rows += [f"| `{one.key}` | {escaped(one.asks)} | {escaped(one.assumes)} |" for one in CRITERIA]
     text = (REPOSITORY / "docs/stability.md").read_text(encoding="utf-8")
     return between(*CRITERIA_TABLE, "\n".join(rows) + "\n", text)

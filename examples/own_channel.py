@@ -1,4 +1,4 @@
-"""A channel of one's own: handovers, in which the link is interrupted for a fixed time. How long may that be?
+"""Your own channel: handovers, in which the link is interrupted for a fixed time. How long may that be?
 
 A channel is a function of the slot k, of random numbers of this slot and of its own state; equal questions get equal
 answers, so all runs of a seed meet the same handovers.

@@ -1,4 +1,4 @@
-"""A control law of one's own, beside the paper's: how fast does each drive back, and is the loop stable?
+"""Your own control law, beside the paper's: how fast does each drive back, and is the loop stable?
 
 A law is a function of the tracking error and of the reference's speeds; its further arguments are its gains, each with
 a default. This one limits the correction of the speed smoothly, so that a large error does not call for 125 m/s.

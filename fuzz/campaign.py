@@ -195,7 +195,7 @@ class Difference(NamedTuple):
 
 
 def compared(found: Case, path: Path, bag: Bag | None) -> Difference:
-    """Compare a bag as we read it, None if we refuse it. Raises NotReadableError if nobody else can."""
+    """Compare a bag as we read it, None if we refuse it. Raises NotReadableError if no other reader can."""
     theirs, ours = Counter[Any](), Counter[Any]()
     if found.base == SQLITE3:
         theirs = payloads_by_sqlite(path)

@@ -57,7 +57,7 @@ def _rows(data: bytes) -> Iterator[Row]:
 
 
 def _once(known: dict[int, Any], record: Any) -> None:
-    """A definition that another one of its number contradicts is left to whoever reads it."""
+    """A definition that another one of its number contradicts is left to its reader."""
     if known.setdefault(record.id, record) != record:
         raise NotReadableError("defined in two ways")
 

@@ -156,7 +156,7 @@ class KnownTypes:
                 source = "ROS 2" if self._folder is None else str(self._folder)
                 return Definition(schema.defined_by("ros2msg", text.encode()), source, "lacks types, those of")
         except UndecodableError:
-            pass  # whoever parses it says why
+            pass  # parsing it says why
         return Definition(schema, "")
 
     def _read(self, kind: str) -> str | None:

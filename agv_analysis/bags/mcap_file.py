@@ -105,7 +105,7 @@ class McapFile:
         """Open the file. Raises BagError if it cannot be read or is no MCAP file.
 
         `keep_all`: attachments, records of unknown kinds, and the messages of channels that are not described, whose
-        topic nobody knows.
+        topic is unknown.
         """
         self.path = path
         self.findings = Findings()
@@ -194,7 +194,7 @@ class McapFile:
         self.findings.add(f"file that begins with {begin.hex(' ')} instead of {MAGIC.hex(' ')}")
 
     def _read_summary(self) -> None:
-        """Definitions and statistics from the end of the file, where they can be had before the first message."""
+        """Definitions and statistics from the end of the file, where they are available before the first message."""
         end = self._footer_position()
         footer = self._footer(end)
         if footer is None:

@@ -59,7 +59,7 @@ class Contents:
     distro: str = ""
     """ROS distribution of the recorder."""
     custom_data: dict[str, str] | None = None
-    """What whoever recorded it has said of it (`ros2 bag record --custom-data`)."""
+    """What was noted when it was recorded (`ros2 bag record --custom-data`)."""
     findings: Findings = field(default_factory=Findings)
 
     def compare(self, topics: Mapping[str, _Found], findings: Findings) -> None:
@@ -85,7 +85,7 @@ class Contents:
     def _renamed(self, topics: Mapping[str, _Found]) -> list[tuple[list[str], list[str]]]:
         """Topics of metadata.yaml that are not in the bag, with those of equal type and count that are not in it.
 
-        Several that are equal in this are together: which is which nobody can tell, but none is missing.
+        Several that are equal in this are together: which is which is ambiguous, but none is missing.
         """
         strange = {name: found for name, found in topics.items() if name not in self.counts}
         groups: dict[tuple[str, int], list[str]] = {}

@@ -90,7 +90,7 @@ def corridor_json(within: CorridorOfRun | None) -> dict[str, Any]:
 def needs_ros(otherwise: str = "") -> Iterator[None]:
     """Where something is imported that needs ROS 2: without it the command ends with a line that says so.
 
-    `otherwise` goes to its end: what can be had all the same.
+    `otherwise` goes to its end: what works without ROS.
     """
     try:
         yield

@@ -29,7 +29,9 @@ _LONG = 2**25
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter of PARAMS.")
 @click.option("--corridor", type=click.FloatRange(min=0.0, min_open=True), help="How often is it further off [m]?")
 @click.option("--format", "name", help="The format of FILE, if it cannot be told by what is in it.")
-@click.option("--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between packets [s], if unsaid.")
+@click.option(
+    "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between packets [s] where FILE has none."
+)
 @click.option("--column", "columns", multiple=True, metavar="ROLE=NAME", help="Which column of a table is what.")
 @click.option("--topic", default="", help="Which topic of a bag.")
 @click.option("--received", type=click.Path(path_type=Path), help="The capture at the other end, beside FILE.")

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 @click.option("--corridor-along", type=click.FloatRange(min=0.0, min_open=True), help="So much [m] along the track.")
 @click.option("--link", "file", type=click.Path(path_type=Path), help="A measured link, as `agv-ncs link` reads it.")
 @click.option(
-    "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between its packets [s], if unsaid."
+    "--interval",
+    type=click.FloatRange(min=0.0, min_open=True),
+    help="Time between its packets [s], if not in the file.",
 )
 @click.option("--class", "name", help="A class of service: is it met, would it do, and what does the loop do on it?")
 @click.option("--classes", "files", multiple=True, type=click.Path(path_type=Path), help="A file with more classes.")

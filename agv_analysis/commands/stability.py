@@ -125,7 +125,7 @@ def command(
     elif not twins.is_long_enough and settles_without_losses(scenario):
         said_of_twins += f"; {too_short(twins.left_without_losses)}"
     of_corridor = [*(() if within is None else within.rows()), *(() if kept is None else kept.rows())]
-    for name, value in (*found.rows(), ("Twins of this scenario, simulated", said_of_twins), *of_corridor):
+    for name, value in (*found.rows(), ("Simulation check", said_of_twins), *of_corridor):
         table.add_row(name, escape(value))
     console.print(table)
     best, why_no_gain = _best_gains(scenario)
@@ -159,8 +159,11 @@ def _told(twins: Twins, seeds: range) -> str:
     if twins.different == 1 < len(seeds):
         word = f"contracts to {twins.median:.2g}" if twins.contracting else "does not contract"
         return f"1 run, which {word}: the seeds {seeds[0]} to {seeds[-1]} all give the same"
-    runs = f"{twins.contracting} of {len(seeds)} runs contract (seeds {seeds[0]} to {seeds[-1]})"
-    return f"{runs}, the median to {twins.median:.2g}" if math.isfinite(twins.median) else f"{runs}; the others diverge"
+    runs = f"in {twins.contracting} of {len(seeds)} runs (seeds {seeds[0]} to {seeds[-1]})"
+    converge = f"neighbouring trajectories converge {runs}"
+    if not math.isfinite(twins.median):
+        return f"{converge}; the others diverge"
+    return f"{converge}, in the median to {twins.median:.2g} of their distance"
 
 
 def _best_gains(scenario: Scenario) -> tuple[dict[str, GainChoice], str]:

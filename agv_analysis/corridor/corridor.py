@@ -63,7 +63,7 @@ class Corridor:
     """As `tube`, with what is of second order covered as well; None where none was found that stays inside."""
     tube_reason: str
     stationary: StationaryDeviation | None
-    """Deviation in the long run, by its second moments; None: not computed, `stationary_reason` says why."""
+    """Stationary deviation, by its second moments; None: not computed, `stationary_reason` says why."""
     stationary_reason: str
     leaving: Leaving
     lap: Floats
@@ -258,7 +258,7 @@ def _tubes(loop: LapLoop, longest: int, second_order: bool = True) -> tuple[int 
 
 
 def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:
-    """The deviation in the long run, or why it is not computed."""
+    """The stationary deviation, or why it is not computed."""
     chain, scenario = chain_alone(loop.scenario), loop.scenario
     if not is_random(scenario):
         return None, "nothing is random"

@@ -13,7 +13,7 @@ support function V_k(d) = sup d' z(k), over all sequences, obeys
 
 It is bounded from above on a few directions d: both along x_e, and a polygon in the plane of y_e and theta_e. Any
 other direction is a sum of three of them with positive weights, and V of a sum is at most the sum. Bounds of a lap that
-are no larger at its end than at its beginning hold for ever.
+are no larger at its end than at its beginning hold forever.
 
 This proves the tube for the linear loop with the b_i of the nonlinear one. What is of second order, the `remainder`,
 can be added to each b_i as a box. Its size is measured on the nonlinear loop, from the corners of the very tube, at
@@ -135,7 +135,7 @@ def applies_to(linear: LinearLoop) -> bool:
 
 
 def outer_tube(loop: LapLoop, linear: LinearLoop, n: int) -> Tube | None:
-    """The tube for outages of up to `n` slots; None where it grows out of the corridor, or for ever."""
+    """The tube for outages of up to `n` slots; None where it grows out of the corridor, or forever."""
     bias = biases(loop, linear, n)
     if not np.isfinite(bias.rows).all():
         return None
@@ -221,7 +221,7 @@ def biases(loop: LapLoop, linear: LinearLoop, n: int) -> Biases:
 
 
 def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Floats) -> Tube | None:
-    """The tube with a given remainder; None where it grows out of the corridor, or for ever."""
+    """The tube with a given remainder; None where it grows out of the corridor, or forever."""
     rows, template = len(bias.nominal), template_of(linear, _SIDES_OF_LONG if n > LONG else _SIDES)
     lap = -(-max(rows, n + 2, _WARM_UP) // rows) * rows  # in whole turns of the rows, longer than any memory
     widths = loop.widths

@@ -1,6 +1,6 @@
 """How often a rare event happens, by importance splitting.
 
-A process that runs on for ever, slot by slot, under a channel that is a Markov chain, comes near to an event and goes
+A process that runs on forever, slot by slot, under a channel that is a Markov chain, comes near to an event and goes
 back. How near is a number, its importance: an age, say, or a distance. The event is that it reaches the last of some
 levels. With `home` for the states from which it has come back (the importance below the first level, a fresh message):
 

@@ -47,7 +47,7 @@ _STEPS = 2000
 
 @dataclass(frozen=True)
 class StationaryDeviation:
-    """The deviation in the long run, by step of the lap."""
+    """The stationary deviation, by step of the lap."""
 
     mean_square: Floats
     """E of the squared distance from the reference [m^2], shape (R,); inf where the mean square does not settle."""

@@ -201,7 +201,7 @@ _ADD_TUBE = """(tube, figure) => tube && figure && figure.layout.meta === tube.m
 
 
 def _table(html: Any, rows: list[tuple[str, str, str]], is_pinned: bool) -> list[Any]:
-    """Rows with a third cell only where there is something in it: each cell is felt at every move."""
+    """Rows with a third cell only where there is something in it: each cell costs time at every move."""
     head = [html.Tr([html.Th(""), html.Th("now"), html.Th("pinned")])] if is_pinned else []
     return head + [
         html.Tr([html.Th(name), *(html.Td(cell) for cell in (value, other) if cell)]) for name, value, other in rows
@@ -224,7 +224,7 @@ _DRAWER = "function() { return innerWidth > 900; }"
 
 
 def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page until Ctrl-C or SIGTERM; `ready` is told its address. Port 0: any free one.
+    """Serve the page until Ctrl-C or SIGTERM; `ready` receives its address. Port 0: any free one.
 
     Raises UserError if the port is taken or Dash is not installed.
     """

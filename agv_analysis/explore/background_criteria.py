@@ -174,7 +174,7 @@ class LatestOnlyWorker(Generic[R]):
 
 
 def _begun() -> tuple[Any, Any]:
-    """A process, and the pipe by which it is told what to compute.
+    """A process, and the pipe that carries the calls.
 
     Ctrl-C reaches every process of a terminal, and is the page's own to act upon: a process inherits what is blocked
     when it begins. It is spawned, since the server has threads; multiprocessing's own tracker, which would come up with

@@ -127,7 +127,7 @@ def study(
 
 
 def age_distribution(chain: Chain, count: int) -> Floats:
-    """P(n_ul = j) for j = 0 .. count - 1 in the long run, shape (count,)."""
+    """Stationary P(n_ul = j) for j = 0 .. count - 1, shape (count,)."""
     lost = 1.0 - chain.delivery
     beyond = [1.0]  # P(n_ul >= j)
     state = chain.stationary * lost

@@ -4,7 +4,7 @@ Three ways to it: links that are independent of each other; those of the relay, 
 random numbers in a share of the slots; and a chain fitted to recorded outcomes of both.
 
 A run begins with both channels in their first state. States that they cannot come to from there are left out: two
-periodic channels stay in step for ever, and so do two equal ones that always share their numbers.
+periodic channels stay in step forever, and so do two equal ones that always share their numbers.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ class _Edge:
         return self._list(body, len(data)) if kind == ASK and len(body) >= _ASK.size else b""
 
     def _number(self, address: tuple[str, int], one: int) -> int:
-        """What a hello from this address must bring back: nobody else was told it."""
+        """What a hello from this address must bring back: no other address has received it."""
         said = f"{address[0]}/{address[1]}/{one}".encode()
         return int.from_bytes(hashlib.blake2b(said, key=self._secret, digest_size=8).digest(), "big")
 
@@ -271,14 +271,14 @@ def _hello(udp: socket.socket, name: str, asked: bytes) -> Numbers:
                 break
         else:
             raise ProbeError(
-                f"{name}: nobody answers: start `agv-ncs probe --listen` there, let UDP pass, or wait until it has "
+                f"{name}: no answer: start `agv-ncs probe --listen` there, let UDP pass, or wait until it has "
                 "done with another peer"
             )
     return one, number
 
 
 def _send(udp: socket.socket, data: bytes) -> None:
-    with contextlib.suppress(OSError):  # the network is down, or nobody listens: lost, as on any other way
+    with contextlib.suppress(OSError):  # the network is down, or no process listens: lost, as on any other way
         udp.send(data)
 
 

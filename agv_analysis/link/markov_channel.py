@@ -137,7 +137,7 @@ def why_no_chain(channel: ChannelParameters) -> str:
 
 
 def cycle_of(transition: Floats) -> NDArray[np.int64] | None:
-    """The states of a chain in the order in which it goes through them all, for ever; None if it does anything else."""
+    """The states of a chain in the order in which it goes through them all, forever; None if it does anything else."""
     after = transition.argmax(axis=1)
     if not np.array_equal(transition, np.eye(len(after))[after]):
         return None

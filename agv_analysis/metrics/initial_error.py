@@ -1,7 +1,7 @@
 """What becomes of the error that a run begins with, apart from what outages do.
 
 Under outages the error has two causes: that the AGV began beside its reference, and that it is driven by outdated
-poses. The first is told from the second by a twin: the same AGV, begun on the reference, under the same losses, ages,
+poses. A twin separates the first from the second: the same AGV, begun on the reference, under the same losses, ages,
 noise and slip, in the simulation. What is left of the initial error is the difference between the two. A recording
 that the simulation does not reproduce has no twin; there the initial error is the error until the first outage, and
 what came later says nothing of it.
@@ -19,7 +19,7 @@ from agv_analysis.metrics.error_metrics import settling_step, wrapped
 from agv_analysis.run import Floats, Run
 
 TWIN, UNTIL_FIRST_OUTAGE = "twin", "until_first_outage"
-"""How the initial error is told from what outages do."""
+"""How the initial error is separated from what outages do."""
 
 FARTHER = 2.0
 """Without a twin, and without an outage: beyond this multiple of the initial error it is not what the run shows."""
@@ -68,7 +68,7 @@ def until_first_outage(run: Run, body: Floats, why: str) -> InitialError:
         found = _judged(UNTIL_FIRST_OUTAGE, run.k, _with_wrapped_angle(body), STILL_THERE)
         return _unless_there_is_more(found, np.hypot(body[:, 0], body[:, 1]), why)
     cut = f"the first outage, at step {int(run.k[end])}, came before the initial error had settled, and {why}"
-    # A loss in slot k is felt from the pose of step k + 1 on.
+    # A loss in slot k has an effect from the pose of step k + 1 on.
     found = _judged(UNTIL_FIRST_OUTAGE, run.k[: end + 1], _with_wrapped_angle(body[: end + 1]), cut)
     if found.settle_2pct_steps is None and found.overshoot is not None:
         found = InitialError(found.of, found.settle_1cm_steps, None, None, cut)

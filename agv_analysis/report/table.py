@@ -60,7 +60,7 @@ def print_table(analysis: Observations) -> None:
 
 
 def print_side_by_side(analyses: Mapping[str, Observations]) -> None:
-    """Print the figures of several runs, a column for each under its name, then what each must be told of."""
+    """Print the figures of several runs, a column for each under its name, then its warnings and notes."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -112,7 +112,7 @@ def outage_test(runs: Runs) -> Values:
 
 
 def outages_on(track: str) -> Values:
-    """The largest eigenvalue over a lap for ever more outages."""
+    """The largest eigenvalue over a lap for more and more outages."""
     return {f"{n} outages: |lambda|": _largest_radius(track, n) for n in (0, 13, 200, 2000)}
 
 
@@ -236,7 +236,7 @@ def limited_high(runs: Runs) -> Values:
 
 
 def more_oscillation(runs: Runs) -> Values:
-    """Settling of the command for ever larger oscillations."""
+    """Settling of the command for larger and larger oscillations."""
     return command_settlings(runs, HIGH, 300.0, 350.0)
 
 

@@ -100,7 +100,7 @@ def rows_of_service(found: OnService) -> Iterator[Row]:
     if channel.failure is not None:
         yield (
             "A failure lasts, on average",
-            f"{_ms(channel.failure)} longer" if math.isfinite(channel.failure) else "for ever",
+            f"{_ms(channel.failure)} longer" if math.isfinite(channel.failure) else "forever",
         )
     if (offered.availability, offered.mtbf, offered.loss_rate) != (None, None, None):
         yield "As a channel", channel.why

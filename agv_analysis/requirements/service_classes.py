@@ -27,7 +27,7 @@ class ServiceClass:
     """Where the figures stand; `own figures` for a user's."""
     table: str
     version: str
-    """Of the document; `not recorded` where nobody noted it."""
+    """Of the document; `not recorded` where it is not recorded."""
     read: bool
     """Did somebody read the figures in the document itself?"""
     availability: float | None = None

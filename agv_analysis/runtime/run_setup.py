@@ -31,7 +31,7 @@ _LEAST_WINDOW = parameters_of(LoopParameters)["stamp_window"].low or 0.0
 def scenario_that_waits(scenario: Scenario, recorded: bool) -> Scenario:
     """The scenario with nodes that wait for each other, and for the recorder.
 
-    Raises TraceError as the nodes would, and UserError if they would wait for ever.
+    Raises TraceError as the nodes would, and UserError if they would wait forever.
     """
     if scenario.error_detector.trigger == "timer" and scenario.plant.clock == "lockstep":
         raise UserError(

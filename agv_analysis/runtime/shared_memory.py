@@ -1,8 +1,8 @@
 """Segments of shared memory that processes of DDS left behind when they were killed: later runs can hang on them.
 
-Whoever uses a segment has it mapped or open, or holds the lock on the file beside it; Fast DDS asks the same lock. One
-that is neither belongs to no process that lives, though it may have been made by one in a container, which is not seen
-in /proc but whose lock is.
+A process that uses a segment has it mapped or open, or holds the lock on the file beside it; Fast DDS asks the same
+lock. One that is neither belongs to no process that lives, though it may have been made by one in a container, which is
+not seen in /proc but whose lock is.
 """
 
 from __future__ import annotations

@@ -320,7 +320,7 @@ def history(reference: Rows, inputs: RunInputs, rows: NDArray[np.float64], n_ul:
 class RunMetrics(NamedTuple):
     """Metrics of one run as `convergence` and `outages` define them; unless they say otherwise, of y_r - y_c in `map`.
 
-    What becomes of the initial error is told by `decay.decay`.
+    `decay.decay` says what becomes of the initial error.
     """
 
     steps: int

@@ -2,7 +2,7 @@
 
     paper        |lambda| < 1 for A(k) at every step: blind to outages on a straight track
     lifted       the pose is n steps old at every step, speeds frozen: a delay; over a lap that turns: `floquet`
-    bursts       up to n losses in a row, in any order, for ever: a joint spectral radius, bounded from both sides
+    bursts       up to n losses in a row, in any order, forever: a joint spectral radius, bounded from both sides
     mean_square  random losses, E[|e|^2] dies out: a Markov jump linear system; `almost_sure`: almost every run does
     both_links   the same where commands are lost as well
     floquet      one lap, or one recorded sequence of losses, again and again: what that very lap does

@@ -28,7 +28,7 @@ _OF_GAINS = (
     "margin", "feasible", "infeasible_reason", "nominal_notes", "confidence", "growth_interval", "record_seconds_more",
     "stationarity", "driven",
 )  # fmt: skip
-"""Figures that nobody knows without the gains."""
+"""Figures that are unknown without the gains."""
 
 
 @dataclass(frozen=True)

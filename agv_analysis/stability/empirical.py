@@ -36,7 +36,7 @@ class Twins:
     """Distances of twins in (x, y, theta) [m, m, rad] at the end of a run, as multiples of those at its beginning."""
 
     contraction: Floats
-    """One value a run, shape (runs,); inf if the loop left the range of numbers."""
+    """One value a run, shape (runs,); inf if the loop is no longer finite."""
     different: int | None = None
     """How many of the runs differ from each other: 1 where nothing depends on the seed. None: unknown."""
     steps: int | None = None
@@ -114,7 +114,7 @@ def is_unstable(contraction: float, left: float) -> bool | None:
 def left_without_losses(scenario: Scenario) -> float:
     """Distance of twins at the end of a run without losses, as a multiple of that at its beginning.
 
-    0 where the reference never moves: what the commands do not reach stays for ever, however long the run.
+    0 where the reference never moves: what the commands do not reach stays forever, however long the run.
     """
     relay = RelayParameters(ts=scenario.relay.ts, start_time=scenario.relay.start_time)
     return _left(replace(scenario, relay=relay))  # the same whatever the links are

@@ -344,7 +344,7 @@ _WATCHED = 20_000
 
 
 def _what_it_does_instead(model: LoopModel, v_r: Floats, w_r: Floats) -> str:
-    """In words: it falls behind, it leaves all bounds, or it goes to and fro."""
+    """In words: it falls behind, it leaves all bounds, or it oscillates."""
     laps = max(2, math.ceil(2 * _WATCHED / len(v_r)))
     rows = model.drive(model.start(v_r, w_r), np.tile(v_r, laps), np.tile(w_r, laps))
     errors = rows[:, :ERRORS]
@@ -355,10 +355,10 @@ def _what_it_does_instead(model: LoopModel, v_r: Floats, w_r: Floats) -> str:
     distance = np.hypot(errors[:, 0], errors[:, 1])
     drift = float(distance[-1] - distance[half]) / ((len(errors) - half) * ts)
     if drift * (len(errors) - half) * ts > 0.4 * float(distance[half:].max()):  # of a steady drift it is half
-        return f"without any loss the AGV falls behind its reference by {drift:.3g} m/s for ever"
+        return f"without any loss the AGV falls behind its reference by {drift:.3g} m/s forever"
     spread = np.ptp(errors[half:], axis=0)
     return (
-        "without any loss the loop does not settle: it goes to and fro by "
+        "without any loss the loop does not settle: it oscillates by "
         f"{spread[0]:.3g} m along, {spread[1]:.3g} m across the track and {spread[2]:.3g} rad"
     )
 

@@ -233,7 +233,7 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
         agree = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
         unsure = _left_open_by_losses(facts) if agree else "the halves of the run do not agree"
         if has_late(run.downlink) and of_ages is not (growth < 0.0):  # ages that add up are no chain of their own
-            unsure = "the chain of ages and these very ages do not agree"
+            unsure = "the chain of ages and this sequence of ages do not agree"
         return _with_growth(common, growth, "late_and_lost", unsure)
     why = "messages were late, by no constant delay, which no criterion covers"
     if has_late(run.downlink):
@@ -241,7 +241,7 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
     if run.is_late:
         why = "poses or commands came later than their slots say, which no criterion covers"
     if of_ages is not None:
-        why += f"; under these very ages a small error {'shrinks' if of_ages else 'grows'}"
+        why += f"; under this sequence of ages a small error {'shrinks' if of_ages else 'grows'}"
     return replace(common, not_covered=why)
 
 

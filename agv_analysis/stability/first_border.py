@@ -1,7 +1,7 @@
 """Where a loop changes from stable to unstable, and back, as one number grows: a loss probability, a burst, a delay.
 
 More of it need not be worse: behind a wrong predictor rare receptions may do harm that yet rarer ones do not. So no
-search here takes for granted that a loop which is unstable at some number is so at all larger ones. Margins are first
+search here assumes that a loop which is unstable at some number is so at all larger ones. Margins are first
 borders: the largest number up to which all smaller ones are stable, as far as a grid can tell.
 """
 

@@ -14,7 +14,7 @@ nu(j) = E_z z(j) + E_h h(j), what a step of the plant does and the model does no
     h(k) = C z(k) - S(k),    S(k) = nu(k-1) + P_h(k-1) nu(k-2) + ... + P_h(k-1) ... P_h(k-n+1) nu(k-n)
 
 z and the last n innovations are the state of the loop. The recursion h(k+1) = P_h h + P_u u + P_h(k) ... P_h(k-n+1)
-nu(k-n) says the same but holds the modes of the model itself as well, which stay for ever and hide those of the loop.
+nu(k-n) says the same but holds the modes of the model itself as well, which stay forever and hide those of the loop.
 So S is summed anew: a sliding window as two stacks (the older part summed from its end, the younger from its
 beginning), which costs the same for every n.
 """

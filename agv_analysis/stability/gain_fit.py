@@ -33,7 +33,7 @@ _ROUNDING = 1e-15
 """Error of a recorded command, relative to the largest: that of its own arithmetic."""
 
 _TOLD = 1e-7
-"""A gain is told by the errors if rounding puts it wrong by less than this, relative to it."""
+"""The errors determine a gain if rounding changes it by less than this, relative to it."""
 
 _BELOW_LIMIT = 1.0 - 1e-9
 """Commands below this share of the largest |v| are taken for unlimited."""

@@ -20,7 +20,7 @@ from agv_cloud.parameters import ControllerParameters
 
 
 def largest_radius(loop: LinearLoop, n: int) -> float:
-    """Largest spectral radius at any speed of the lap, held for ever, for a pose that is always `n` steps old.
+    """Largest spectral radius at any speed of the lap, held forever, for a pose that is always `n` steps old.
 
     In closed form where there is one; else the growth factor per step over the lap. An exact prediction is as good as
     a fresh pose.
@@ -34,7 +34,7 @@ def largest_radius(loop: LinearLoop, n: int) -> float:
 
 
 def largest_n(loop: LinearLoop, limit: int = 100_000) -> int | None:
-    """Largest n up to which every speed of the lap, held for ever, is stable; -1: not even 0, None: over `limit`.
+    """Largest n up to which every speed of the lap, held forever, is stable; -1: not even 0, None: over `limit`.
 
     The closed forms for a straight track say where to look, the spectral radius at the lap's speeds decides. Without a
     closed form the lap as a whole decides, as of `floquet.largest_constant_delay`.
@@ -49,7 +49,7 @@ def largest_n(loop: LinearLoop, limit: int = 100_000) -> int | None:
 
 
 def worst_step(loop: LinearLoop, n: int) -> int:
-    """A step of the lap whose speeds, held for ever, are the worst for a pose that is always `n` steps old.
+    """A step of the lap whose speeds, held forever, are the worst for a pose that is always `n` steps old.
 
     In closed form where there is one; else the fastest step.
     """

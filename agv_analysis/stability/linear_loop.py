@@ -238,7 +238,7 @@ def kanayama_loop(
 def _reachable(v_r: Floats, w_r: Floats) -> int:
     """How many of (x_e, y_e, theta_e) the commands can move on a track with these speeds: all 3 if it moves at all.
 
-    A parked AGV reaches only x_e; one that turns on the spot mixes y_e into it and reaches 2. The rest stays as it is.
+    A parked AGV reaches only x_e; one that turns in place mixes y_e into it and reaches 2. The rest stays as it is.
     """
     if np.any(v_r != 0.0):
         return 3

@@ -65,7 +65,7 @@ class Margins:
 
     @property
     def n_bursts(self) -> int | None:
-        """Most consecutive losses, in any order, for ever, under which the loop is proved to contract."""
+        """Most consecutive losses, in any order, forever, under which the loop is proved to contract."""
         found: int | None = self._value("n_max.bursts")
         return found
 

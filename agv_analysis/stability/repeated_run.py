@@ -381,5 +381,5 @@ def _meets(one: Floats, other: Floats, columns: NDArray[np.int64]) -> bool:
 
 
 def _moved_by_commands(loop: LinearLoop) -> NDArray[np.int64]:
-    """Which of x_e, y_e, theta_e the commands reach: a parked AGV keeps its error across for ever."""
+    """Which of x_e, y_e, theta_e the commands reach: a parked AGV keeps its error across forever."""
     return np.arange(min(3, loop.size))

@@ -31,7 +31,7 @@ _MOST_STEPS = 20_000
 _MOST_SLOTS = 4_000_000
 
 _WINDOWS = 20
-"""Runs of which the deviations are told, at most."""
+"""Most runs whose deviations are listed."""
 
 
 @dataclass(frozen=True)

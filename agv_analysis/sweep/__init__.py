@@ -29,4 +29,4 @@ CORRIDOR_COLUMNS = (
 """What a point with a corridor says of it, see docs/corridor.md."""
 
 MOST_POINTS = 200
-"""Points up to which a sweep asks for verdicts unless it is told to: each takes a fraction of a second."""
+"""Points up to which a sweep gives verdicts by default: each takes a fraction of a second."""

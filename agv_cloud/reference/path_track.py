@@ -92,7 +92,7 @@ def _pieces(points: Sequence[Point], corner: float) -> Iterator[tuple[tuple[floa
         cut = next_cut
         if not is_last:
             # The circle that touches both lines at the distance `cut` has the radius cut / tan(half). Where the path
-            # turns back there is none: the reference turns on the spot.
+            # turns back there is none: the reference turns in place.
             half = 0.5 * math.remainder(headings[i + 1] - heading, math.tau)
             arc = 2.0 * cut * (half / math.tan(half) if half else 1.0)
             if arc > _SAME_PLACE:

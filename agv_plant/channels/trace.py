@@ -11,7 +11,7 @@ from agv_ros.errors import UserError, open_text
 from agv_ros.json_text import parse_json
 
 ENDS = ("repeat", "hold", "stop")
-"""What follows the last outcome: the first one again, deliveries for ever, or an error."""
+"""What follows the last outcome: the first one again, deliveries forever, or an error."""
 
 _WORDS = {
     "lost": {"0": False, "1": True},

@@ -45,7 +45,7 @@ def _device(line: str) -> str:
 
 
 _HARMLESS = ("netem", "noqueue", "pfifo", "pfifo_fast", "bfifo", "fq", "fq_codel", "mq", "prio")
-"""Kinds of qdisc that a message of the loop does not meet, or waits behind nobody in."""
+"""Kinds of qdisc that a message of the loop does not meet, or does not wait in."""
 
 
 def _others(head: bytes, device: str) -> Iterator[str]:

@@ -195,7 +195,7 @@ class Criterion:
     asks: str
     """Its question in a sentence, for the documentation."""
     assumes: str
-    """What it takes for granted, in a sentence."""
+    """What it assumes, in a sentence."""
     judge: Callable[[RunFacts], Judgement | None] = lambda _: None
     """What it says of a run; None where it does not apply."""
     margins: Callable[[ScenarioFacts], Iterable[Margin]] = nothing

@@ -96,9 +96,9 @@ def _at_once(facts: RunFacts) -> Iterable[Row]:
         return
     n = paper.largest_n(run.reference[:, 2], run.reference[:, 3], run.scenario.controller, run.ts)
     if n is None:
-        yield "Paper's test", "holds for any number of outages"
+        yield "Paper's test", "tolerates any number of consecutive outages"
     else:
-        yield "Paper's test", "fails even without outages" if n < 0 else f"holds for up to {n} outages in a row"
+        yield "Paper's test", "fails even without outages" if n < 0 else f"tolerates up to {n} consecutive outages"
 
 
 def _border(scenario: Scenario) -> float:

@@ -70,7 +70,7 @@ def test_what_is_not_random_is_asked_of_one_lap() -> None:
     assert never.mean_time is not None
     assert never.mean_time.value == pytest.approx(29 * 0.005)  # the 28th loss in a row leads outside
     delayed = of(0.02, "relay.uplink.model=perfect", "relay.uplink.delay=0.05", "error_detector.track=line")
-    assert delayed.p_lap.low == 1.0  # v n T_s = 5 cm off for ever
+    assert delayed.p_lap.low == 1.0  # v n T_s = 5 cm off forever
 
 
 def test_laps_are_parts_of_a_long_measured_link(tmp_path: Path) -> None:

@@ -243,7 +243,7 @@ def test_the_presets_tell_the_story(base: Scenario) -> None:
     assert list(PRESETS) == ["paper", "missed", "predicted"]
     assert late("paper")[0] < 1e-6
     error, paper = late("missed")
-    assert paper == "holds for any number of outages"
+    assert paper == "tolerates any number of consecutive outages"
     assert error > 1e3
     assert late("predicted")[0] < 1e-6
 

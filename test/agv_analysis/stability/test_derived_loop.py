@@ -222,7 +222,7 @@ def test_a_look_ahead_is_the_reference_of_later() -> None:
 
 
 def test_an_agv_that_is_slower_than_its_reference_has_no_nominal_motion() -> None:
-    with pytest.raises(NoNominalMotionError, match=r"falls behind its reference by 0\.2 m/s for ever"):
+    with pytest.raises(NoNominalMotionError, match=r"falls behind its reference by 0\.2 m/s forever"):
         loop_of("error_detector.track=line", "controller.v_max=0.8")
 
 

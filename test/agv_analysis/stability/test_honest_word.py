@@ -28,7 +28,7 @@ from agv_analysis.sweep.verdicts import with_verdicts
 PAPER, LINE = str(Path(__file__).parents[3] / "config/paper.yaml"), "error_detector.track=line"
 
 BEHIND = (LINE, "controller.v_max=0.8")
-"""Slower than the reference: it falls behind by 0.2 m/s for ever."""
+"""Slower than the reference: it falls behind by 0.2 m/s forever."""
 
 SWINGS = (
     LINE, "plant.speed_scale=1.3", "controller.kx=1.0", "controller.ky=64.0", "controller.ktheta=16.0",

@@ -95,7 +95,7 @@ def test_recorded_runs_of_the_nodes_on_both_sides_of_the_border(drive: Callable[
 
 @pytest.mark.parametrize(("n", "amplitude"), [(14, 0.0), (16, 0.24), (20, 0.37)])
 def test_a_limit_on_speed_bounds_what_is_unstable(n: int, amplitude: float) -> None:
-    """It oscillates for ever; a stable loop is at most n T_s v_r ahead of its reference, v_r = 1 m/s."""
+    """It oscillates forever; a stable loop is at most n T_s v_r ahead of its reference, v_r = 1 m/s."""
     setting = ["error_detector.track=line", "controller.v_max=6.0", "relay.uplink.model=burst", f"relay.uplink.n={n}"]
     run = simulate(load_scenario(CONFIG, setting))
     distance = np.hypot(*(run.reference[:, :2] - run.pose[:, :2]).T)

@@ -168,7 +168,7 @@ def test_a_trace_is_one_run_whatever_the_seed(agv_ncs: Callable[..., tuple[int, 
     assert json.loads(path.read_text())["empirical"]["different_runs"] == 1
     status, said = agv_ncs("stability", "config/paper.yaml", *words, "--set", "plant.noise_xy=0.001", "--json", path)
     assert status == 0, said
-    assert "20 of 20 runs contract" in " ".join(said.split())
+    assert "neighbouring trajectories converge in 20 of 20 runs" in " ".join(said.split())
     assert json.loads(path.read_text())["empirical"]["different_runs"] == 20  # by their noise
 
 

@@ -21,7 +21,7 @@ CYCLE = (
     LINE, "plant.speed_scale=1.3", "controller.kx=1.0", "controller.ky=64.0", "controller.ktheta=16.0",
     "error_detector.speed=2.0",
 )  # fmt: skip
-"""THEORY: with a true speed of 1.3 times the commanded one the heading gain is negative: it swings for ever."""
+"""THEORY: with a true speed of 1.3 times the commanded one the heading gain is negative: it swings forever."""
 
 TURNED = (
     LINE, "controller.ky=64.0", "controller.ktheta=16.0", "relay.uplink.model=burst", "relay.uplink.n=30",

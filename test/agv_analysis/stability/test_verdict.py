@@ -101,7 +101,7 @@ DRIFTS = dataclasses.replace(STAYS, stays=False, largest_deviation=40.0)
         (Evidence(n=15, n_bursts=14, growth=0.1, v_max=6.0), "unstable", "mean square"),
         (Evidence(n=15, n_bursts=14, growth=0.1), "unstable", "mean square of the error grows"),
         (Evidence(n=5, growth_of="both_links", growth=-0.1), "mean-square", "commands were lost"),
-        (Evidence(n=5, growth=None, not_covered="nobody knows"), "unknown", "nobody knows"),
+        (Evidence(n=5, growth=None, not_covered="it is not recorded"), "unknown", "it is not recorded"),
         (Evidence(n=6, late_by=6, lifted_radius=0.9), "asymptotic", "6 steps old"),
         (Evidence(n=6, late_by=6, lifted_radius=1.1), "unstable", "6 steps old"),
     ],

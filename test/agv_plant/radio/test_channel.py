@@ -77,7 +77,7 @@ def test_changed_parameters_hold_from_the_next_slot_on(model: str) -> None:
     [
         ChannelParameters(model="gilbert_elliott", p=0.01, r=0.3),
         ChannelParameters(model="gilbert_elliott", p=0.0005, r=0.001, h=0.2, k=0.9),
-        ChannelParameters(model="gilbert_elliott", p=0.3, r=0.3),  # both states change in the same slots, for ever
+        ChannelParameters(model="gilbert_elliott", p=0.3, r=0.3),  # both states change in the same slots, forever
         ChannelParameters(model="gilbert_elliott", p=0.01, r=0.3, schedule="200: p=0.3"),
         ChannelParameters(model="bernoulli", p=0.3),
     ],

@@ -83,7 +83,7 @@ def test_the_angle_is_that_of_ros2_controllers(v: float, w: float) -> None:
 
 
 def test_standing_still_it_steers_as_far_as_it_goes_and_does_not_turn() -> None:
-    """Their turn on the spot is +-pi/2, too; nobody turns without moving."""
+    """Their turn in place is +-pi/2, too; nobody turns without moving."""
     assert steering_angle(0.0, 0.0, 1.0) == 0.0
     assert steering_angle(0.0, 1e-9, 1.0) == math.pi / 2.0
     assert steering_angle(0.0, -3.0, 1.0) == -math.pi / 2.0
