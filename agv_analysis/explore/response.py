@@ -53,7 +53,7 @@ def respond(scenario: Scenario, pinned: Scenario | None = None) -> Response:
     values = list(summary_rows(run, strays))
     others = values_of_other or {}
     return Response(
-        track=figure([first], MOST_POINTS, markers=_MOST_MARKERS),
+        track=figure([first], MOST_POINTS, markers=_MOST_MARKERS, is_tight=False),
         time=figure(over_time, MOST_POINTS),
         rows=[(name, value, others.get(name, "")) for name, value in values],
         badge=_badge(run, strays),

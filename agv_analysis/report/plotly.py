@@ -75,8 +75,12 @@ _GAP = 0.22
 """Share of a row that is left free above it, for its legend."""
 
 
-def figure(panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST_MARKERS) -> dict[str, Any]:
+def figure(
+    panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST_MARKERS, is_tight: bool = True
+) -> dict[str, Any]:
     """A figure of panels one below the other on one common x axis, which zooms all of them.
+
+    `is_tight`: axes of one scale end where the track does, which takes plotly.js some 40 ms longer.
 
     Lines are drawn as vectors: without a graphics card WebGL takes seconds for what they take a tenth of one, and in
     print they stay sharp.
@@ -99,13 +103,14 @@ def figure(panels: Sequence[Panel], most: int = MOST_POINTS, markers: int = MOST
     if rows > 1:  # one cursor through all of them
         layout["hoversubplots"] = "axis"
         layout["xaxis"] |= {"showspikes": True, "spikemode": "across", "spikesnap": "hovered data", **_SPIKE}
-    if is_track and _is_broad(panels[0]):
+    is_tight = is_tight and is_track and _is_broad(panels[0])
+    if is_tight:
         layout["xaxis"]["constrain"] = "domain"
     for row, panel in enumerate(panels):
         number = str(row + 1) if row else ""
         top = 1.0 - row / rows - (_GAP / rows if rows > 1 else 0.0)
         bottom = 1.0 - (row + 1) / rows
-        layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel)}
+        layout[f"yaxis{number}"] = {"domain": [max(0.0, bottom), top], **_y_axis(panel, is_tight)}
         layout[f"legend{number}"] = _LEGEND_BELOW if is_long else {**_LEGEND, "y": top, "yanchor": "bottom"}
         of_row = {"yaxis": f"y{number}", "legend": f"legend{number}"}
         found += [_trace(line, most, markers) | of_row for line in panel.lines]
@@ -129,12 +134,12 @@ def _is_broad(panel: Panel) -> bool:
     return 1.0 / _LONGEST < aspect(panel) < _LONGEST
 
 
-def _y_axis(panel: Panel) -> dict[str, Any]:
+def _y_axis(panel: Panel, is_tight: bool) -> dict[str, Any]:
     axis: dict[str, Any] = {"title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "power"}
     if panel.log:
         axis["type"] = "log"
     if panel.equal:
-        axis |= {"scaleanchor": "x", "scaleratio": 1} | ({"constrain": "domain"} if _is_broad(panel) else {})
+        axis |= {"scaleanchor": "x", "scaleratio": 1} | ({"constrain": "domain"} if is_tight else {})
     if panel.y_range is not None:
         axis["range"] = list(panel.y_range)
     return axis
