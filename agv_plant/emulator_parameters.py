@@ -95,7 +95,7 @@ class LinkEmulatorParameters(TwoDomains):
             again = {before for before, _ in ways[heard]} & {behind for _, behind in ways[other]}
             if again:
                 raise ParameterError(
-                    f"{', '.join(sorted(again))} would cross the link for ever: {heard}.topics hears what "
+                    f"{', '.join(sorted(again))} would cross the link forever: {heard}.topics hears what "
                     f"{other}.topics publishes; name another topic behind the radio"
                 )
         for name, direction in self.directions.items():

@@ -1,7 +1,7 @@
 """A radio link for topics of any type: what crosses it is lost, late or doubled as a channel of this package says.
 
 Messages are passed on as they are, serialised. Types and QoS are those that the publishers offer, once there is one. A
-latched topic is state that DDS sends to whoever comes later, so it is passed on without loss. Services, actions and
+latched topic is state that DDS sends to later subscribers, so it is passed on without loss. Services, actions and
 parameters are left alone.
 """
 
@@ -223,7 +223,7 @@ class EmulatedTopic:
         if self._refusal:
             facts[f"{self.heard} does not cross"] = self._refusal
         elif self._offer is None:
-            facts[f"{self.heard} does not cross"] = "nobody publishes it"
+            facts[f"{self.heard} does not cross"] = "it has no publisher"
         return facts
 
 

@@ -1,7 +1,7 @@
 """Arrays that may be larger than memory: columns that go on in a file, and figures of what is looked at part by part.
 
 Theory of operation. A column that grows beyond `_IN_MEMORY` bytes moves to a temporary file without a name, which is
-mapped into memory. Whoever goes through a large array does so in `parts`, and gives back after each what the mapping
+mapped into memory. Code that goes through a large array does so in `parts`, and gives back after each what the mapping
 holds (`release`): the process then has some MB of it at a time, whatever its length. The pages are those of a file, of
 which the system keeps as many as it has room for.
 """

@@ -152,7 +152,7 @@ def _of_period(loop: LinearLoop, lost: Outcomes, period: int) -> _Found:
 
 
 def growth_of_period(loop: LinearLoop, pattern: Outcomes) -> float:
-    """Growth of E[e^2] (logarithm, per step) if outcomes, shape (P,), of which some are received, repeat for ever."""
+    """Growth of E[e^2] (logarithm, per step) if outcomes, shape (P,), of which some are received, repeat forever."""
     steps = _whole(loop, len(pattern))
     from_reception = np.roll(pattern, -int(np.argmin(pattern)))
     return 2.0 * float(drop_sequence(loop, np.resize(from_reception, steps), 1)[0]) / steps
