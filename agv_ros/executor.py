@@ -170,7 +170,7 @@ def params_files_in(words: Sequence[str]) -> list[str]:
 
 
 def _say_on_rosout(name: str, failure: str) -> None:
-    """Tell those who watch /rosout why this node ends; it may never have been made, and then there is nothing to wait for."""
+    """Say on /rosout why this node ends; it may never have been made. Waits for subscribers for a moment only."""
     herald = Node(f"{name.lower()}_failure", enable_rosout=False, start_parameter_services=False)
     publisher = herald.create_publisher(Log, "/rosout", _ROSOUT_QOS)
     deadline = time.monotonic() + _ROSOUT_PATIENCE

@@ -24,7 +24,7 @@ from agv_analysis.explore.layout import SHOWN_FOR_A_LAW, STYLE, layout, styles_o
 from agv_analysis.explore.positions import difference, from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, Values, preset_values, scenario_of, values_of
-from agv_analysis.explore.sliders import CHANNEL_SLIDERS, CHOICES, SLIDERS, acts
+from agv_analysis.explore.sliders import CHANNEL_SLIDERS, CHOICES, GAIN_SLIDERS, SLIDERS, acts
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -92,9 +92,10 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
         *settings, pinned, _ = given
         now = values(tuple(settings))
         story = next((PRESETS[key].text for key, preset in presets.items() if preset == now), "")
+        chosen = GAIN_SLIDERS.get(now["law"], ())
         of_setting = (
             "" if pinned is None else difference(now, pinned), story, to_hash(now, at_first),
-            *(f"{now[slider.key]:g}" for slider in _LOG_SLIDERS),
+            *(f"{now[slider.key]:g}" if slider in chosen else dash.no_update for slider in _LOG_SLIDERS),
         )  # fmt: skip
         try:
             found = respond(asked(now), None if pinned is None else asked(pinned))

@@ -279,7 +279,7 @@ def test_a_type_that_is_not_installed_is_said_once_and_the_rest_crosses(
     ("values", "reason"),
     [
         ({"uplink.topics": ("/a:=/a",)}, "uplink.topics: /a is called the same on both sides"),
-        ({"uplink.topics": ("/a:=/b",), "downlink.topics": ("/b:=/c",)}, "/b would cross the link for ever"),
+        ({"uplink.topics": ("/a:=/b",), "downlink.topics": ("/b:=/c",)}, "/b would cross the link forever"),
         ({"uplink.topics": ("/a b",)}, "topics holds '/a b'"),
         ({"uplink.topics": ()}, "uplink.topics is a list of one or more strings"),
         ({"uplink.topics": ("/a",), "uplink.schedule": "20: p=0.1"}, "set its period"),
