@@ -16,7 +16,7 @@ from agv_analysis.link.periodic_outages import period_of, scripted_outages
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability import lifted, mean_square, mean_square_two_links
+from agv_analysis.stability import lifted, mean_square, mean_square_downlink
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence, link_confidence
 from agv_analysis.stability.confidence.segment_confidence import growth_of_period
 from agv_analysis.stability.criteria import CRITERIA
@@ -192,7 +192,7 @@ def _to_judge(scenario: Scenario) -> Scenario:
 
 def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
     """With the growth under the links of a scenario; as a run of it shows them where one of them is no finite chain."""
-    run, relay, policy = facts.run, facts.run.scenario.relay, facts.run.scenario.plant.downlink_policy
+    run, relay, plant = facts.run, facts.run.scenario.relay, facts.run.scenario.plant
     uplink, downlink = chain_of(relay.uplink), chain_of(relay.downlink)
     if facts.is_late and _constant_delay(facts) is None:
         of_channel = growth_of_channel(facts.loop, relay, run.ts)
@@ -206,10 +206,10 @@ def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Jud
     if downlink.loss_rate == 0.0:
         growth = mean_square.lap_growth(facts.loop, uplink) / len(run)
         return _with_growth(replace(common, is_unlimited=_is_random(uplink)), growth)
-    if policy not in mean_square_two_links.POLICIES:
+    if mean_square_downlink.why_not(plant):
         return _of_both_links(common, facts, judgements)
     links = joint_chain.correlated(uplink, downlink, relay.downlink.correlation)
-    both = mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
+    both = mean_square_downlink.lap_growth(facts.loop, links, plant) / len(run)
     return _with_growth(common, both, "both_links")
 
 
@@ -274,13 +274,13 @@ def _constant_delay(facts: RunFacts) -> int | None:
 def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
     """Sure is what holds at both ends of the intervals of the fitted channels."""
     run, (_, growth) = facts.run, judgements["mean_square"].detail
-    policy = run.scenario.plant.downlink_policy
+    plant = run.scenario.plant
     if growth is None:
-        why = f"commands were lost, and no criterion covers downlink policy {policy}"
+        why = f"commands were lost, and no criterion covers downlink policy {plant.downlink_policy}"
         return replace(common, not_covered=why, goes_on=_goes_on(run))
 
     def growth_under(links: JointChain) -> float:
-        return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
+        return mean_square_downlink.lap_growth(facts.loop, links, plant) / len(run)
 
     if joint_chain.fitted(run.lost, run.downlink_lost) is None:
         end = -1 if growth < 0.0 else 0

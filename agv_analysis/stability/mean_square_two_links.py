@@ -36,7 +36,7 @@ from agv_analysis.stability.mean_square import growth_of_repeated, growth_over_l
 from agv_analysis.stability.products import assign, divide, largest_entry, multiply_sparse
 
 POLICIES = ("hold", "zero")
-"""Downlink policies that are a Markov jump linear system of (z, h, u); others remember more."""
+"""Downlink policies that are a Markov jump linear system of (z, h, u); for others see `mean_square_downlink`."""
 
 _LARGEST = 400
 """Size of the recursion's matrix up to which its eigenvalues are asked for instead of driving laps."""
@@ -47,7 +47,12 @@ def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> floa
 
     `stops`: the plant stops where a command is lost, instead of holding the one before.
     """
-    maps = np.stack([step_maps(loop, *outcome, stops) for outcome in OUTCOMES], axis=1)
+    maps = [step_maps(loop, *outcome, share=0.0 if stops else 1.0) for outcome in OUTCOMES]
+    return growth_of_maps(loop, np.stack(maps, axis=1), links)
+
+
+def growth_of_maps(loop: LinearLoop, maps: Floats, links: JointChain) -> float:
+    """The same under the maps of each outcome of `links`, shape (R, outcomes, n, n)."""
     states, size = len(links.transition), maps.shape[-1]
     if loop.is_constant and states * size**2 <= _LARGEST:
         return loop.steps * math.log(np.abs(np.linalg.eigvals(operator(maps[0], links))).max())
@@ -63,17 +68,20 @@ def lap_growth(loop: LinearLoop, links: JointChain, stops: bool = False) -> floa
     return growth_over_lap(loop, (moments,), lambda steps: float(compiled(_drive_lap)(maps, *links, steps, moments)))
 
 
-def step_maps(loop: LinearLoop, pose: bool, command: bool, stops: bool) -> Floats:
-    """A_o of one outcome of a step: is the pose delivered, is the command? Shape (R, n, n), n = m + q + 2."""
+def step_maps(loop: LinearLoop, pose: bool, command: bool, share: float = 1.0) -> Floats:
+    """A_o of one outcome of a step: is the pose delivered, is the command? Shape (R, n, n), n = m + q + 2.
+
+    Where the command is lost the plant acts on a `share` of the one that it holds; where that is 0 it holds none.
+    """
     m, q = loop.size, loop.outputs
     z, h, u = np.split(np.eye(m + q + 2), [m, m + q])
     h_now = z[:q] if pose else h
     sent = loop.L_h @ h_now + loop.L_z @ z
-    acted = sent if command else np.broadcast_to(np.zeros_like(u) if stops else u, sent.shape)
-    moved = loop.A @ z + loop.B @ acted + loop.D @ h_now
+    kept = sent if command else np.broadcast_to(u if share > 0.0 else np.zeros_like(u), sent.shape)
+    moved = loop.A @ z + loop.B @ (kept if command else share * kept) + loop.D @ h_now
     held = np.broadcast_to(h_now, (len(moved), q, m + q + 2))
     h_next = held if loop.P_h is None or loop.P_u is None else loop.P_h @ h_now + loop.P_u @ sent
-    return np.concatenate((moved, h_next, acted), axis=1)
+    return np.concatenate((moved, h_next, kept), axis=1)
 
 
 def operator(maps: Floats, links: JointChain) -> Floats:

@@ -9,7 +9,7 @@ from agv_analysis.json_values import finite
 from agv_analysis.link import joint_chain
 from agv_analysis.link.markov_channel import chain_of, renewal_chain, shortest_mean_burst, why_no_chain
 from agv_analysis.scenario import Scenario
-from agv_analysis.stability import mean_square, mean_square_two_links
+from agv_analysis.stability import mean_square, mean_square_downlink
 from agv_analysis.stability.criteria.criterion import (
     Border,
     Criterion,
@@ -31,13 +31,13 @@ def growth_on_both_links(facts: RunFacts) -> float | None:
 
     Where the recorded outcomes say that the links fail together, or by turns, they are one chain.
     """
-    run, policy = facts.run, facts.run.scenario.plant.downlink_policy
-    if policy not in mean_square_two_links.POLICIES or not run.downlink_lost.any():
+    run, plant = facts.run, facts.run.scenario.plant
+    if not run.downlink_lost.any() or mean_square_downlink.why_not(plant):
         return None
     links = joint_chain.fitted(run.lost, run.downlink_lost)
     if links is None:
         links = joint_chain.independent(facts.fit.chain, facts.downlink_fit.chain)
-    return mean_square_two_links.lap_growth(facts.loop, links, stops=policy == "zero") / len(run)
+    return mean_square_downlink.lap_growth(facts.loop, links, plant) / len(run)
 
 
 def _judge(facts: RunFacts) -> Judgement | None:

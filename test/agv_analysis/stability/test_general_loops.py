@@ -390,7 +390,7 @@ def test_the_moments_of_many_driven_loops(stops: bool) -> None:
     start = np.concatenate((np.ones(m + q), loop.L_h[0] @ np.ones(q) + loop.L_z[0] @ np.ones(m)))
     X = np.outer(start, start)
     outcomes = [
-        mean_square_two_links.step_maps(loop, pose, command, stops)
+        mean_square_two_links.step_maps(loop, pose, command, float(not stops))
         for pose, command in itertools.product((True, False), repeat=2)
     ]
     weights = [(1 - p) ** 2, (1 - p) * p, p * (1 - p), p * p]

@@ -243,7 +243,7 @@ def test_outcomes_that_repeat_exactly_are_judged_by_simulation_where_no_criterio
     n: int, kx: float, word: str
 ) -> None:
     lossy = ("relay.downlink.model=burst", f"relay.downlink.n={n}", "plant.downlink_policy=ramp")
-    scenario = scenario_of(LINE, *lossy, f"controller.kx={kx}", "plant.duration=20.0", "plant.ramp_time=1.0")
+    scenario = scenario_of(LINE, *lossy, f"controller.kx={kx}", "plant.duration=20.0", "plant.ramp_time=3.0")
     contracts = simulate_batch([scenario], [1], twins=True)["contraction"][0, 0] < 1.0
     found = analyse(simulate(scenario))
     assert (found.verdict.word, contracts) == (word, word == "mean-square")

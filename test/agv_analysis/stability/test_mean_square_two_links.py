@@ -74,7 +74,8 @@ def test_the_moments_are_those_of_all_that_can_happen(
     stops: bool, loop: LinearLoop, uplink: Chain, downlink: Chain, steps: int
 ) -> None:
     maps = [
-        mean_square_two_links.step_maps(loop, u, d, stops)[0] for u, d in itertools.product((True, False), repeat=2)
+        mean_square_two_links.step_maps(loop, u, d, float(not stops))[0]
+        for u, d in itertools.product((True, False), repeat=2)
     ]
     transition, probabilities = independent(uplink, downlink)
     start = np.concatenate((np.ones(6), loop.L_h[0] @ np.ones(3)))
@@ -180,14 +181,14 @@ def test_the_margins_have_it_where_commands_are_lost() -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "reason"),
+    ("settings", "reason"),
     [
-        ("plant.downlink_policy=ramp", "not for ramp"),
-        ("relay.downlink.p=0.0", "loses nothing"),
+        (["plant.downlink_policy=ramp", "plant.ramp_time=60.0"], "up to 400 steps"),
+        (["relay.downlink.p=0.0"], "loses nothing"),
     ],
 )
-def test_where_there_is_no_answer_there_is_a_reason(setting: str, reason: str) -> None:
+def test_where_there_is_no_answer_there_is_a_reason(settings: list[str], reason: str) -> None:
     line = ("error_detector.track=line", "relay.downlink.model=bernoulli", "relay.downlink.p=0.6")
-    found = margins(load_scenario(PAPER, [*line, setting]))
+    found = margins(load_scenario(PAPER, [*line, *settings]))
     assert found.both_links is None
     assert reason in found.to_json()["both_links"]["mean_square_growth_reason"]
