@@ -145,6 +145,7 @@ def _drive_predicted(
     since, product, fresh = np.eye(q), np.eye(q), np.empty_like(z)
     log_scale, at = 0.0, n
     for k in range(steps):
+        of_innovation = 0.0
         if n > 0:
             if at == n or k == 0:  # all that is in the window is in `past`, in order
                 at = 0
@@ -174,9 +175,10 @@ def _drive_predicted(
                     younger[i, j] = S[i, j] + nu[i, j]
             multiply(P[row], since, False, product, False)
             assign(product, since)
+            of_innovation = largest_entry(nu)
             at += 1
         assign(fresh, z)
-        largest = largest_entry(fresh)
+        largest = max(largest_entry(fresh), of_innovation)  # while a limit is active z does not grow with them
         if largest > 1e100 or 0.0 < largest < 1e-100:
             divide(z, largest)
             divide(younger, largest)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from agv_analysis.stability.floquet import constant_delay, drop_sequence, largest_constant_delay
-from agv_analysis.stability.linear_loop import kanayama_loop
+from agv_analysis.stability.linear_loop import LinearLoop, kanayama_loop
 from agv_analysis.stability.linearisation import step_matrices
 from agv_analysis.stability.products import growths, log_spectral_radius, ordered_product
 from agv_cloud.parameters import ControllerParameters
@@ -138,3 +138,16 @@ def test_a_nilpotent_product() -> None:
     factors[:, 0, 1] = 1.0
     assert log_spectral_radius(factors) == -math.inf
     assert growths(factors).tolist() == [-math.inf, -math.inf]
+
+
+def test_what_a_predictor_does_not_know_may_grow_while_a_limit_holds_the_agv() -> None:
+    """No command reaches the error, which halves with each step; the model takes it that each does, and answers 1.6."""
+    steps, half = 2000, 0.5 * np.eye(3)
+    nothing, model, law = np.zeros((steps, 3, 2)), np.zeros((steps, 3, 2)), np.zeros((steps, 2, 3))
+    model[:, 0, 0], law[:, 0, 0] = 1.6, 1.0
+    loop = LinearLoop(
+        TS, np.ones(steps), np.zeros(steps), A=np.tile(half, (steps, 1, 1)), B=nothing, D=np.zeros((steps, 3, 3)),
+        L_h=law, L_z=nothing.swapaxes(1, 2), P_h=np.tile(half, (steps, 1, 1)), P_u=model,
+    )  # fmt: skip
+    assert constant_delay(loop, 0) == pytest.approx(steps * math.log(0.5))
+    assert constant_delay(loop, 1) == pytest.approx(steps * math.log(1.6), rel=0.01)
