@@ -21,7 +21,7 @@ from agv_analysis.stability.linear_loop import LinearLoop
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, RAMP, share_of_command
 from agv_plant.parameters import PlantParameters
 
-_LONGEST_RAMP = 400
+_LONGEST_RAMP = 200
 """Steps of the longest ramp that is judged."""
 
 _WORK, _FEWEST = 4e6, 50
@@ -76,13 +76,22 @@ def with_age_of_command(links: JointChain, last: int) -> JointChain:
     share = np.stack((heard, 1.0 - heard))  # of slots whose command is delivered, and lost
     with np.errstate(invalid="ignore", divide="ignore"):
         pose = np.nan_to_num(np.stack((both / share[0], pose_alone / share[1])))
-    states = [(s, n) for s in range(len(heard)) for n in range(ages) if share[min(n, 1), s] > 0.0]
+    successors = [[int(t) for t in np.flatnonzero(row > 0.0)] for row in links.transition]
+    begun = np.flatnonzero(heard > 0.0)
+    states = [(int(s), 0) for s in begun] if len(begun) else [(0, min(1, last))]
     place = {state: i for i, state in enumerate(states)}
-    transition, outcomes = np.zeros((len(states), len(states))), np.zeros((len(states), 2 * ages))
-    for i, (s, n) in enumerate(states):
-        outcomes[i, n], outcomes[i, ages + n] = pose[min(n, 1), s], 1.0 - pose[min(n, 1), s]
-        for t in np.flatnonzero(links.transition[s] > 0.0):
+    moves: list[tuple[int, int, float]] = []
+    for i, (s, n) in enumerate(states):  # which grows by those that follow
+        for t in successors[s]:
             for lost, after in enumerate((0, min(n + 1, last))):
                 if share[lost, t] > 0.0:
-                    transition[i, place[int(t), after]] += links.transition[s, t] * share[lost, t]
+                    if (t, after) not in place:
+                        place[t, after] = len(states)
+                        states.append((t, after))
+                    moves.append((i, place[t, after], float(links.transition[s, t] * share[lost, t])))
+    transition, outcomes = np.zeros((len(states), len(states))), np.zeros((len(states), 2 * ages))
+    for i, j, probability in moves:
+        transition[i, j] += probability
+    for i, (s, n) in enumerate(states):
+        outcomes[i, n], outcomes[i, ages + n] = pose[min(n, 1), s], 1.0 - pose[min(n, 1), s]
     return JointChain(transition, outcomes)

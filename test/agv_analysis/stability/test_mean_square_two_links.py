@@ -183,7 +183,7 @@ def test_the_margins_have_it_where_commands_are_lost() -> None:
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        (["plant.downlink_policy=ramp", "plant.ramp_time=60.0"], "up to 400 steps"),
+        (["plant.downlink_policy=ramp", "plant.ramp_time=60.0"], "up to 200 steps"),
         (["relay.downlink.p=0.0"], "loses nothing"),
     ],
 )
