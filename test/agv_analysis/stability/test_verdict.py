@@ -194,7 +194,7 @@ def test_losses_on_both_links_are_judged_together(p: float, word: str) -> None:
 
 def test_a_downlink_policy_that_no_criterion_covers() -> None:
     lossy = ("relay.downlink.model=bernoulli", "relay.downlink.p=0.3", "plant.downlink_policy=ramp")
-    found = of(*lossy, "plant.duration=5.0")
+    found = of(*lossy, "plant.ramp_time=5.0", "plant.duration=5.0")
     assert found.verdict.word == "unknown"
     assert "ramp" in found.verdict.margin
 
