@@ -277,6 +277,8 @@ def _of_both_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, J
     plant = run.scenario.plant
     if growth is None:
         why = f"commands were lost, and no criterion covers downlink policy {plant.downlink_policy}"
+        if reason := mean_square_downlink.why_not(plant):
+            why += f", {reason}"
         return replace(common, not_covered=why, goes_on=_goes_on(run))
 
     def growth_under(links: JointChain) -> float:

@@ -444,7 +444,7 @@ def test_the_sentence_says_how_it_is(lap: Analysis) -> None:
     [
         (("relay.downlink.p=0.3",), "on radio links like these, which lose commands as well"),
         (("relay.downlink.p=0.98",), "does not keep to its track: losses on both links, of poses and of commands, are"),
-        (("relay.downlink.p=0.3", "plant.downlink_policy=ramp"), "no criterion covers downlink policy ramp"),
+        (("relay.downlink.p=0.3", "plant.downlink_policy=ramp", "plant.ramp_time=5.0"), "downlink policy ramp"),
     ],
 )
 def test_the_sentence_does_not_blame_the_uplink_for_the_downlink(settings: tuple[str, ...], said: str) -> None:
