@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from agv_analysis.commands import needs_ros, with_settings, write_json
+from agv_analysis.commands import corridor_settings, needs_ros, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.runtime.fleet import Vehicle
@@ -39,6 +39,10 @@ PITCH = 20.0
     metavar="N",
     help="N loops, in the namespaces agv_01, agv_02, ..., that share one uplink; each records to BAG/agv_01, ...",
 )
+@click.option(
+    "--corridor", type=click.FloatRange(min=0.0, min_open=True), metavar="D",
+    help="The AGV should stay within D [m] of its reference: recorded for `analyse`, and how much of it a fleet uses.",
+)  # fmt: skip
 @click.option("--pitch", type=float, default=PITCH, show_default=True, help="Fleet: distance between tracks [m].")
 def command(
     params: str,
@@ -51,6 +55,7 @@ def command(
     duration: float | None,
     seed: int | None,
     fleet: int | None,
+    corridor: float | None,
     pitch: float,
 ) -> None:
     """Run the loop of the params file PARAMS on DDS, or a fleet of such loops.
@@ -69,7 +74,7 @@ def command(
 
     shorthands = {"plant.clock": clock, "plant.duration": duration, "relay.seed": seed, "plant.seed": seed}
     given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
-    scenario = load_scenario(params, (*settings, *given))
+    scenario = load_scenario(params, (*settings, *given, *corridor_settings(corridor, None)))
     if fleet is not None:
         _run_fleet(scenario, fleet, pitch, bag, processes, (fsync, if_unwritable))
         return

@@ -205,7 +205,7 @@ def _gains_to_json(best: dict[str, GainChoice], why_no_gain: str) -> dict[str, A
 def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Path, report: Path | None) -> None:
     """Write and draw the map over two axes."""
     from agv_analysis.commands.progress import step_bar
-    from agv_analysis.corridor.corridor_map import with_corridor
+    from agv_analysis.corridor.corridor_map import best_point, with_corridor
     from agv_analysis.report.margin_map_files import draw, write_csv
     from agv_analysis.stability.margin_map import margin_map, ranges_of
     from agv_ros.errors import UserError
@@ -216,10 +216,13 @@ def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Pa
     first, second = ranges_of(scenario, names, points)
     with step_bar(points * points, "computing the map") as progress:
         found = margin_map(scenario, (names[0], names[1]), first, second, progress)
-    with step_bar(points * points, "within the corridor") as progress:
-        found = with_corridor(found, scenario, progress)
+    if scenario.error_detector.corridor > 0.0:
+        with step_bar(points * points, "within the corridor") as progress:
+            found = with_corridor(found, scenario, progress)
     write_csv(csv_file, found)
     draw(picture, found)
+    if best := best_point(found):
+        click.echo(f"corridor: {best}")
     click.echo(f"map:     {csv_file}\npicture: {picture}")
     if report is not None:
         from agv_analysis.report.map_page import write_map_page

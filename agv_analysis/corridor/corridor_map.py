@@ -57,6 +57,7 @@ def with_corridor(
     if policy in ("hold", "align") and has_closed_form(scenario, v, v * np.abs(at[CURVATURE]).max()):
         advance = at[TS] ** 2 * at["kx"] * at[SPEED] if policy == "hold" else np.zeros(rows.shape)
         single = np.vectorize(lambda one: _longest(one, widths), otypes=[np.int64])(advance)
+        progress(rows.size)
     else:
         places = [{name: float(values[place]) for name, values in at.items()} for place in np.ndindex(rows.shape)]
         driven = []
@@ -71,6 +72,24 @@ def with_corridor(
         rate = np.vectorize(lambda n: _rate(chain, n), otypes=[np.float64])(single)
         margins[P_HOUR] = np.where(margins[N_ANY] < 0, 1.0, -np.expm1(-rate * _HOUR / at[TS]))
     return replace(found, margins=margins)
+
+
+def best_point(found: MarginMap) -> str:
+    """The point of a map that leaves its corridor most rarely, of equal ones that with the largest n_any, in words.
+
+    Where the uplink is no Markov chain that with the largest n_any. Empty without a corridor, or if all points leave it
+    without outages.
+    """
+    n_any, p_hour = found.margins.get(N_ANY), found.margins.get(P_HOUR)
+    if n_any is None or (n_any < 0).all():
+        return ""
+    rank = (-n_any,) if p_hour is None else (-n_any, p_hour)
+    row, column = np.unravel_index(np.lexsort(tuple(key.ravel() for key in rank))[0], n_any.shape)
+    where = f"{found.labels[0]} = {found.first[row]:.4g}, {found.labels[1]} = {found.second[column]:.4g}"
+    n = int(n_any[row, column])
+    outages = "any outages" if n >= LIMIT else f"any outages of up to {n} slots"
+    left = "" if p_hour is None else f", left in an hour with probability {p_hour[row, column]:.3g}"
+    return f"best kept at {where}: in {outages}{left}"
 
 
 def _driven(scenario: Scenario, place: Mapping[str, float], widths: Widths) -> int:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from agv_analysis.corridor.corridor_map import N_ANY, P_HOUR, with_corridor
+from agv_analysis.corridor.corridor_map import N_ANY, P_HOUR, best_point, with_corridor
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.single_outage import single_outage
 from agv_analysis.corridor.widths import Widths
@@ -30,6 +30,16 @@ def test_points_say_what_single_scenarios_say() -> None:
             assert found.margins[N_ANY][i, j] == min(n, found.margins["n_bursts"][i, j])
             rate = 0.02 * 0.2 / 0.22 * 0.8**n  # of outages that are longer
             assert found.margins[P_HOUR][i, j] == pytest.approx(-math.expm1(-rate * 720_000))
+
+
+def test_the_best_point_is_named() -> None:
+    base, gains, periods = scenario(*CHOSEN), np.array([5.0, 25.0, 100.0]), np.array([0.005, 0.02])
+    found = with_corridor(margin_map(base, ("kx", "ts"), gains, periods), base)
+    row, column = divmod(int(np.argmin(found.margins[P_HOUR])), 2)
+    said = best_point(found)
+    assert f" = {gains[row]:.4g}, " in said
+    assert f" = {periods[column]:.4g}: in any outages of up to {found.margins[N_ANY][row, column]} slots" in said
+    assert best_point(margin_map(base, ("kx", "ts"), gains, periods)) == ""
 
 
 def test_without_a_closed_form_each_point_is_driven() -> None:

@@ -427,10 +427,8 @@ def test_the_margins_of_the_lap_come_after(page: Page, base: Scenario) -> None:
 
 
 def test_a_tube_is_drawn_on_the_figure_of_its_own_setting_alone(page: Page) -> None:
-    from selenium.webdriver.common.by import By
-
-    more = page.chrome.find_element(By.ID, "more")
-    more.send_keys("error_detector.track=line\nerror_detector.corridor=0.25\nplant.duration=5.0")
+    more = "error_detector.track=line\\nerror_detector.corridor=0.25\\nerror_detector.lap_time=4.0"
+    page.chrome.execute_script(f"dash_clientside.set_props('more', {{ value: '{more}' }})")
     page.until(lambda: any("tube for any outages" in name for name in page.names("track")))
     late = "{ mark: 'another setting', traces: [{ x: [0, 1], y: [0, 1], name: 'late' }] }"
     drawn = f"dash_clientside.set_props('tube', {{ data: {late} }})"
