@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from agv_analysis.corridor.corridor import corridor
 from agv_analysis.corridor.lap_loop import LapLoop, outage
 from agv_analysis.corridor.rare_leaving import leaving_rate
-from agv_analysis.corridor.single_outage import roughly, single_outage
+from agv_analysis.corridor.single_outage import single_outage
 from agv_analysis.corridor.widths import Widths
+from agv_analysis.explore.settings import values_of
 from agv_analysis.link.markov_channel import chain_of
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from benchmarks.comparison import Comparison
+from benchmarks.explore import scenario_and_answer
 
 CONFIG = str(Path(__file__).parent.parent / "config" / "outages.yaml")
 HALF_WIDTH = 0.6
@@ -28,7 +31,12 @@ LENGTH = 35
 """Slots of the outage from every step."""
 PLACES = 50
 """Places at which the peer is measured."""
-AIM_S, AIM_ROUGH_S = 5.0, 0.2
+AIM_S, AIM_MOVE_S = 5.0, 0.2
+POLICIES: dict[str, list[str]] = {
+    "hold": [],
+    "align": ["error_detector.policy=align"],
+    "predict, 10 % too fast": ["error_detector.policy=predict", "plant.speed_scale=1.1"],
+}
 
 
 def measure() -> list[Comparison]:
@@ -64,15 +72,36 @@ def measure() -> list[Comparison]:
         Comparison(
             "rate of leaving 0.6 m, with its interval", split, "simulated laps", laps, "s", smaller_is_better=True
         ),
-        Comparison(
-            "stability --corridor, without the margins", _seconds(1, lambda: corridor(scenario)), "what it may take",
-            AIM_S, "s", 1.0, smaller_is_better=True,
+        *(
+            Comparison(
+                f"stability --corridor, {policy}", _seconds(2, lambda options=options: _command(options)),  # type: ignore[misc]
+                "what it may take", AIM_S, "s", 1.0, smaller_is_better=True,
+            )
+            for policy, options in POLICIES.items()
         ),
-        Comparison(
-            "one outage, roughly, as the explorer says it", _seconds(3, lambda: roughly(loop)), "what it may take",
-            AIM_ROUGH_S, "s", 1.0, smaller_is_better=True,
+        *(
+            Comparison(
+                f"a move in the explorer with a corridor, {policy}", _move(options), "at once", AIM_MOVE_S, "s", 1.0,
+                smaller_is_better=True,
+            )
+            for policy, options in POLICIES.items()
         ),
     ]  # fmt: skip
+
+
+def _command(options: list[str]) -> None:
+    """The whole command, with start of Python, margins and twins."""
+    settings = [word for option in options for word in ("--set", option)]
+    words = sys.executable, "-m", "agv_analysis.cli", "stability", CONFIG, "--corridor", str(HALF_WIDTH), *settings
+    subprocess.run(words, check=True, capture_output=True)
+
+
+def _move(options: list[str]) -> float:
+    """Seconds of the slowest of five moves, in the server."""
+    base = load_scenario(CONFIG, [f"error_detector.corridor={HALF_WIDTH}", *options])
+    values = values_of(base)
+    scenario_and_answer(base, values, None)  # compiles
+    return max(scenario_and_answer(base, {**values, "kx": 20.0 + move}, None) for move in range(5))
 
 
 def _seconds(tries: int, work: Callable[[], object]) -> float:

@@ -39,11 +39,18 @@ def twins_border(scenario: Scenario, seeds: int = SEEDS, progress: Callable[[int
         nonlocal done
         uplink = dataclasses.replace(scenario.relay.uplink, model="bernoulli", p=p, schedule="")
         lossy = dataclasses.replace(scenario, relay=dataclasses.replace(scenario.relay, uplink=uplink))
-        first = scenario.relay.seed
-        found = simulate_batch([lossy], range(first, first + seeds), twins=True)["contraction"][0]
+        first, needed = scenario.relay.seed, seeds // 2 + 1
+
+        def contracting(begin: int, end: int) -> int:
+            found = simulate_batch([lossy], range(first + begin, first + end), twins=True)["contraction"][0]
+            return int((found < 1.0).sum())
+
+        count = contracting(0, needed)
+        if count < needed <= count + seeds - needed:  # else the others cannot change it
+            count += contracting(needed, seeds)
         done += 1
         progress(done)
-        return int((found < 1.0).sum()) * 2 > seeds
+        return count >= needed
 
     left = left_without_losses(scenario)
     if LONG_ENOUGH < left < math.inf and settles_without_losses(scenario):
