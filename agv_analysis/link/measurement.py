@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,7 +113,7 @@ class Measurement:
         """Time from the first packet sent to the last [s]."""
         return float(self.sent[-1] - self.sent[0])
 
-    @property
+    @cached_property
     def interval(self) -> float:
         """Median time between packets sent [s]; 0 for a single one."""
         if self.packets < 2:
