@@ -22,7 +22,7 @@ _PLACES, _SHORTER = 128, 32
 FEW_PLACES = 40
 """Places of the lap for a rough answer."""
 
-_FINE, _NEAR, _ALIKE = 8, 0.95, 1e-9
+_FINE, _NEAR, _ALIKE = 8, 0.98, 1e-9
 """Every so many steps of the lap an outage is driven; between them where it comes so near to the worst, or outside,
 unless places differ by less than that."""
 
