@@ -112,6 +112,8 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
         assert found.low is not None
         assert found.high is not None
         return st.integers(int(found.low), int(found.high))
+    if found.kind == "bool":
+        return st.booleans()
     if found.kind == "double_array":
         numbers, length = st.floats(allow_nan=False, allow_infinity=False), found.length
         return st.lists(numbers, min_size=length or 1, max_size=length or 9).map(tuple)
@@ -121,7 +123,8 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
 ALONE = {
     "track", "wait_for_subscribers", "stop_timeout", "frame_prefix", "plan_steps", "downlink_policy", "look_ahead",
     "stamp_window",
-    *(f"{link}.{name}" for link in ("uplink", "downlink") for name in ("schedule", "hole_circles", "hole_polygons")),
+    *(f"{link}.{name}" for link in ("uplink", "downlink")
+      for name in ("schedule", "hole_circles", "hole_polygons", "reliable")),
 }  # fmt: skip
 """What a file may not set for one node without setting something else."""
 
