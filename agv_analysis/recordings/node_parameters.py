@@ -37,6 +37,9 @@ _OF_A_REPLAY = ("plan_steps", "trigger", "command_type")
 _CHANGE = re.compile(r"(.*) -> (.*) after step (-?\d+)", re.DOTALL)
 """What diagnostics say of a change."""
 
+_OURS = "kx"
+"""A parameter that the controller of this package has in every version."""
+
 _VALUES = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value", 8: "double_array_value"}
 """Field of rcl_interfaces/ParameterValue by its type."""
 
@@ -53,6 +56,8 @@ class Said(NamedTuple):
     """Changes after its first step, by step."""
     notes: tuple[str, ...]
     """A sentence for each parameter that was another than expected, and for each change."""
+    foreign_controller: str = ""
+    """Name of the node that gave the commands if it is none of this package; its law is not known."""
 
 
 def said_by_nodes(bag: Bag, names: Mapping[str, str], diagnostics: str, scenario: Scenario, source: str) -> Said:
@@ -79,7 +84,16 @@ def said_by_nodes(bag: Bag, names: Mapping[str, str], diagnostics: str, scenario
             at_start[change.node][change.name] = change.new
     driven = begun.with_values(at_start, f"{bag.path}: what its nodes said")
     later = tuple(change for change in changes if change.k > first_k)
-    return Said(driven, later, (*_other_values(scenario, driven, source), *map(_of_change, later)))
+    foreign = _foreign_controller(bag, record)
+    return Said(driven, later, (*_other_values(scenario, driven, source), *map(_of_change, later)), foreign)
+
+
+def _foreign_controller(bag: Bag, record: Mapping[str, str]) -> str:
+    """The node that publishes edge/cmd_vel, if it has been asked and has not the parameters of this package's."""
+    if "controller" not in record:
+        return ""
+    sections = parse_sections(record["params"], f"{bag.path}: what its nodes said")
+    return "" if _OURS in sections.get("controller", {}) else record["controller"]
 
 
 def _asked(bag: Bag, record: Mapping[str, str], declared: list[tuple[str, str, Any]]) -> Values:

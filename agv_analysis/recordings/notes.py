@@ -18,6 +18,15 @@ def of_replay(bag: Bag) -> Iterator[str]:
         yield f"a replay of {source}: errors and commands are new, but the AGV moves as it did there, whatever they are"
 
 
+def of_foreign_controller(name: str) -> Iterator[str]:
+    """Did another package's node give the commands?"""
+    if name:
+        yield (
+            f"{name} gave the commands, which is not the controller of this package: its law is not known, so stability "
+            "is not judged, and losses, ages and errors are as they were seen"
+        )
+
+
 def of_first_step(run: Run) -> Iterator[str]:
     """Does it begin after the run did?"""
     first = int(run.k[0])

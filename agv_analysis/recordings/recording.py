@@ -173,11 +173,13 @@ def _run(bag: Bag, names: dict[str, str], said: Said, source: str) -> Run:
         source=source,
         unexplained=unexplained(topics, scenario.grid),
         parameter_changes=said.changes,
+        gains_known=not said.foreign_controller,
     )
     unknown = () if is_true_known or not scenario.plant.is_noisy else (_NO_TRUTH,)
     of_run = (*notes.of_replay(bag), *notes.of_first_step(run))
     of_content = (*notes.of_messages(topics, names), *notes.of_mismatch(run), *notes.of_commands(run))
-    return dataclasses.replace(run, notes=(*bag.problems, *said.notes, *of_run, *of_content, *unknown))
+    foreign = tuple(notes.of_foreign_controller(said.foreign_controller))
+    return dataclasses.replace(run, notes=(*bag.problems, *said.notes, *foreign, *of_run, *of_content, *unknown))
 
 
 def _reference(topics: Mapping[str, OnSteps], k: Steps, scenario: Scenario, source: str) -> Floats:
