@@ -26,7 +26,7 @@ from agv_analysis.commands import (
 @click.option("--namespace", help="Which loop, for a bag of several.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
 @click.option("--pose-topic", help="Another robot's pose: Odometry, PoseWithCovarianceStamped or PoseStamped.")
-@click.option("--command-topic", help="Another robot's command: Twist or TwistStamped.")
+@click.option("--command-topic", help="Another robot's command: Twist, TwistStamped or AckermannDrive(Stamped).")
 @click.option("--reference-topic", help="Another robot's reference: Odometry or Path.")
 @click.option("--track-file", type=click.Path(path_type=Path), help="Another robot's reference: CSV file with t, v, w.")
 @click.option("--topics", type=click.Path(path_type=Path), help="YAML file with the topics: pose, command, reference.")

@@ -22,8 +22,8 @@ def of_foreign_controller(name: str) -> Iterator[str]:
     """Did another package's node give the commands?"""
     if name:
         yield (
-            f"{name} gave the commands, which is not the controller of this package: its law is not known, so stability "
-            "is not judged, and losses, ages and errors are as they were seen"
+            f"{name} gave the commands, which is not the controller of this package: its law is not known, so stability"
+            " is not judged; losses, ages and errors are as they were seen"
         )
 
 

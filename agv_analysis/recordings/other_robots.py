@@ -24,9 +24,12 @@ from agv_analysis.recordings.robot_topics import RobotTopics
 from agv_analysis.recordings.sampling import sampling_notes, sampling_of
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
+from agv_cloud.parameters import CSV
 from agv_cloud.reference.reference import Reference
+from agv_cloud.reference.track_file import load_track
 from agv_ros.errors import UserError
-from agv_ros.stamps import NS_PER_S
+from agv_ros.parameters import as_dict
+from agv_ros.stamps import NS_PER_S, to_nanoseconds
 
 __all__ = ["RobotTopics", "read_robot_run"]
 
@@ -59,7 +62,7 @@ def _scenario(track_file: Path | None, config: Path | None) -> Scenario:
 def _run(
     bag: Bag, topics: RobotTopics, poses: Track, target: Track | None, scenario: Scenario, config: Path | None
 ) -> Run:
-    came = poses if target is None else _covered(poses, target, bag, topics)
+    came = _within_track(poses, scenario) if target is None else _covered(poses, target, bag, topics)
     sampling = sampling_of(came.stamps, f"{bag.path}: {topics.pose}")
     k = np.arange(sampling.k[-1] + 1)
     stamps = np.rint(np.interp(k, sampling.k, came.stamps - came.stamps[0])).astype(np.int64) + came.stamps[0]
@@ -67,7 +70,8 @@ def _run(
     lost = ~np.isin(k, sampling.k)
     fitted = _fitted(scenario, sampling.period, came, has_track_start=config is not None)
     reference = Reference(fitted.error_detector).first(len(k)) if target is None else target.at(stamps)
-    command, command_notes = read_commands(bag, topics.command, came, stamps, sampling.period)
+    wheelbase = as_dict(scenario.plant)["bicycle.wheelbase"] if config is not None else None
+    command, command_notes = read_commands(bag, topics.command, came, stamps, sampling.period, wheelbase)
     run = Run(
         scenario=fitted,
         k=k,
@@ -107,6 +111,15 @@ def _fitted(scenario: Scenario, period: float, came: Track, has_track_start: boo
     )
 
 
+def _within_track(poses: Track, scenario: Scenario) -> Track:
+    """The poses up to the end of a track file, behind which it says nothing."""
+    detector = scenario.error_detector
+    if detector.track != CSV:
+        return poses
+    end = poses.stamps[0] + to_nanoseconds(load_track(detector.track_file).duration)
+    return poses.chosen(poses.stamps <= end)
+
+
 def _covered(poses: Track, target: Track, bag: Bag, topics: RobotTopics) -> Track:
     """The poses from the beginning of the reference to its end: outside there is nothing to compare them with."""
     covered = poses.chosen((poses.stamps >= target.stamps[0]) & (poses.stamps <= target.stamps[-1]))
@@ -125,6 +138,11 @@ def _reference_notes(
     if target is None:
         where = "where the params file says" if has_track_start else "at the AGV's first pose"
         yield f"the track begins {where}, at the time of the first pose"
+        if len(came.stamps) < len(poses.stamps):
+            yield (
+                f"{topics.pose}: {len(poses.stamps) - len(came.stamps)} poses came after the end of the track file, "
+                "they are left out"
+            )
         return
     yield from target.notes
     if len(came.stamps) < len(poses.stamps):

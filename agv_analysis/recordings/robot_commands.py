@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agv_analysis.bags import Bag
 from agv_analysis.bags.layout import LOG_TIME
@@ -10,19 +11,24 @@ from agv_analysis.recordings.clock_steps import other_clock
 from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.recordings.posture_track import Track, by_the_clock_of, messages_of
 from agv_analysis.run import Floats
+from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S
 
-COMMANDS = {"geometry_msgs/msg/Twist": "", "geometry_msgs/msg/TwistStamped": "twist."}
+COMMANDS = {
+    "geometry_msgs/msg/Twist": "", "geometry_msgs/msg/TwistStamped": "twist.",
+    "ackermann_msgs/msg/AckermannDrive": "", "ackermann_msgs/msg/AckermannDriveStamped": "drive.",
+}  # fmt: skip
 """Types of a command, each with what stands before the path of a speed in it."""
 
 
 def read_commands(
-    bag: Bag, topic: str | None, came: Track, stamps: Steps, period: float
+    bag: Bag, topic: str | None, came: Track, stamps: Steps, period: float, wheelbase: float | None
 ) -> tuple[Floats, tuple[str, ...]]:
     """The newest command (v, w) when each period ends, shape (N, 2), NaN before the first; and notes on it.
 
     A command without a stamp belongs to the instant whose pose had just been logged: its log time is carried over to
-    the clock of the poses' stamps.
+    the clock of the poses' stamps. Of a car's commands `wheelbase` [m] makes a rate of turn; without it UserError is
+    raised.
     """
     command = np.full((len(stamps), 2), np.nan)
     if topic is None:
@@ -47,11 +53,27 @@ def read_commands(
     ends = np.append(stamps[1:], stamps[-1] + round(period))
     newest = np.searchsorted(instants[order], ends, side="left") - 1
     known = newest >= 0
-    for column, speed in enumerate(("linear.x", "angular.z")):
-        command[known, column] = messages[prefix + speed][order][newest[known]]
+    for column, speeds in enumerate(_speeds(messages, prefix, f"{bag.path}: {topic}", wheelbase)):
+        command[known, column] = speeds[order][newest[known]]
     if held := int(np.count_nonzero(np.diff(newest[known]) == 0)):
         notes.append(f"{topic}: no command came in {held} of {len(stamps)} steps, the last one is held")
     return command, tuple(notes)
+
+
+def _speeds(messages: NDArray[np.void], prefix: str, where: str, wheelbase: float | None) -> tuple[Floats, Floats]:
+    """Speed and rate of turn [m/s, rad/s] that each message commands, shapes (M,).
+
+    A car of wheelbase L at speed v, whose front wheel is steered by d, turns at v tan(d) / L.
+    """
+    if f"{prefix}steering_angle" not in (messages.dtype.names or ()):
+        return messages[f"{prefix}linear.x"], messages[f"{prefix}angular.z"]
+    if wheelbase is None:
+        raise UserError(
+            f"{where} has steering angles, which say how fast a car turns only with its wheelbase: name a params file "
+            "with plant.bicycle.wheelbase with --config"
+        )
+    v, steering = (messages[prefix + name].astype(np.float64) for name in ("speed", "steering_angle"))
+    return v, v * np.tan(steering) / wheelbase
 
 
 def clock_ahead(bag: Bag, topic: str, came: Track) -> int:

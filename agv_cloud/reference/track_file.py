@@ -26,6 +26,11 @@ class SpeedProfile:
         self._times = [row[0] for row in rows]
         self._rows = rows
 
+    @property
+    def duration(self) -> float:
+        """Time of the last row [s]."""
+        return self._times[-1]
+
     def __call__(self, t: float) -> Speeds:
         """Speeds (v [m/s], w [rad/s]) at time `t` >= 0 [s]."""
         after = bisect.bisect_right(self._times, t)

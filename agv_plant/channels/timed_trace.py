@@ -154,6 +154,7 @@ def _columns_of(header: Sequence[str], link: str, path: str) -> tuple[str, str]:
 
 def _rows(path: str, columns: list[int], header: list[str]) -> Floats:
     """The columns as numbers, shape (n, columns): all at once, or line by line where that does not work."""
+    _refuse_empty_rows(path)
     try:
         return np.loadtxt(
             path, delimiter=",", skiprows=1, usecols=columns, ndmin=2, encoding="utf-8-sig", comments=None
@@ -168,6 +169,17 @@ def _rows(path: str, columns: list[int], header: list[str]) -> Floats:
             if row:
                 found.append([_number(row, column, header, f"{path}:{reader.line_num}") for column in columns])
     return np.array(found).reshape(-1, len(columns))
+
+
+def _refuse_empty_rows(path: str) -> None:
+    """Raise TraceError for a row without anything in it that others follow: numpy would pass over it."""
+    empty = 0
+    with open_text(path, TraceError, encoding="utf-8-sig") as file:
+        for number, line in enumerate(file, start=1):
+            if empty and not line.isspace():
+                raise TraceError(f"{path}:{empty}: the row is empty")
+            if line.isspace():
+                empty = empty or number
 
 
 def _number(row: Sequence[str], column: int, header: Sequence[str], where: str) -> float:

@@ -53,10 +53,15 @@ def parse_trace(lines: Iterable[str], name: str) -> tuple[bool, ...]:
         if len(named) != 1:
             raise TraceError(f"{name}:1: one column must be called lost or verdict, found {','.join(header)!r}")
         outcomes: list[bool] = []
+        empty = 0
         for row in reader:
-            if row:
-                cells = dict(zip(header, map(str.strip, row), strict=False))
-                outcomes.append(_outcome(cells, named[0], len(outcomes), f"{name}:{reader.line_num}"))
+            if not any(map(str.strip, row)):
+                empty = empty or reader.line_num
+                continue
+            if empty:  # unless nothing follows
+                raise TraceError(f"{name}:{empty}: the row is empty, so what became of its slot is not known")
+            cells = dict(zip(header, map(str.strip, row), strict=False))
+            outcomes.append(_outcome(cells, named[0], len(outcomes), f"{name}:{reader.line_num}"))
     except csv.Error as error:
         raise TraceError(f"{name}:{reader.line_num}: {error}") from None
     if not outcomes:

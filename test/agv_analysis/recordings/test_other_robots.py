@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from agv_analysis.metrics.convergence import wrapped
 from agv_analysis.recordings.other_robots import read_robot_run
@@ -285,6 +285,50 @@ def test_reference_from_a_track_file(tmp_path: Path, truth: Run) -> None:
     config.write_text(truth.scenario.to_yaml())
     assert_is_the_truth(read_robot_run(bag, topics, track, config), truth)
     assert_is_the_truth(read_robot_run(bag, topics, None, config), truth, 1e-8)
+
+
+def test_a_track_file_that_is_shorter_ends_the_run(tmp_path: Path, truth: Run) -> None:
+    bag, track = recording(truth, reference="none").write(tmp_path / "bag"), track_file(tmp_path / "track.csv", truth)
+    rows = track.read_text().splitlines()
+    track.write_text("\n".join(rows[:202]) + "\n")  # the header and steps 0 to 200
+    run = read_robot_run(bag, ALL._replace(reference=None), track)
+    assert run.k[-1] <= 200
+    (note,) = (note for note in run.notes if "after the end of the track file" in note)
+    after = np.count_nonzero(~truth.lost[201:])
+    assert note == f"/odom: {after} poses came after the end of the track file, they are left out"
+
+
+ACKERMANN = """std_msgs/Header header
+AckermannDrive drive
+================================================================================
+MSG: ackermann_msgs/AckermannDrive
+float32 steering_angle
+float32 steering_angle_velocity
+float32 speed
+float32 acceleration
+float32 jerk
+"""
+
+
+def test_a_car_s_commands_turn_it_by_its_wheelbase(tmp_path: Path, truth: Run) -> None:
+    STORE.register(get_types_from_msg(ACKERMANN, "ackermann_msgs/msg/AckermannDriveStamped"))
+    wheelbase = 1.3
+
+    def steered(stamp: int, v: float, w: float) -> Any:
+        angle = float(np.arctan2(wheelbase * w, v)) if v > 0.0 else -float(np.arctan2(wheelbase * w, -v))
+        drive = make(
+            "ackermann_msgs/msg/AckermannDrive", steering_angle=angle, steering_angle_velocity=0.0, speed=v,
+            acceleration=0.0, jerk=0.0,
+        )  # fmt: skip
+        return make("ackermann_msgs/msg/AckermannDriveStamped", header=header(stamp), drive=drive)
+
+    bag = recording(truth, command=steered).write(tmp_path / "bag")
+    with pytest.raises(UserError, match=r"plant\.bicycle\.wheelbase with --config"):
+        read_robot_run(bag, ALL)
+    config = tmp_path / "params.yaml"
+    config.write_text(truth.scenario.with_settings([f"plant.bicycle.wheelbase={wheelbase}"]).to_yaml(of_all_parts=True))
+    run, plain = read_robot_run(bag, ALL, None, config), read_robot_run(recording(truth).write(tmp_path / "plain"), ALL)
+    np.testing.assert_allclose(run.command, plain.command, atol=1e-4)
 
 
 def test_jitter_is_measured_and_loses_nothing(tmp_path: Path, truth: Run) -> None:

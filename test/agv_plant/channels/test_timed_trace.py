@@ -133,6 +133,7 @@ def test_each_direction_has_its_own_columns(tmp_path: Path) -> None:
         ("time,lost\n0,0\nnow,1\n", "t.csv:3: time must be a number of seconds, found 'now'"),
         ("time,lost,delay\n0,0,0.1\n1,0,-0.1\n", "row 2: delay must be >= 0 s and finite, found -0.1"),
         ("time,lost\n", "no rows below the header"),
+        ("time,lost\n0.0,0\n\n0.1,1\n", ":3: the row is empty"),
         ("uplink_lost,downlink_lost\n0,0\n", "has outcomes of each direction, but no column time"),
     ],
 )
