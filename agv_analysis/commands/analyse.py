@@ -25,7 +25,8 @@ from agv_analysis.commands import (
 )
 @click.option("--namespace", help="Which loop, for a bag of several.")
 @click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
-@click.option("--pose-topic", help="Another robot's pose: Odometry, PoseWithCovarianceStamped or PoseStamped.")
+@click.option("--pose-topic", help="Another robot's pose: Odometry, PoseWithCovarianceStamped, PoseStamped, or /tf.")
+@click.option("--pose-frames", nargs=2, metavar="FIXED ROBOT", help="Of /tf: which frames, as map base_link.")
 @click.option("--command-topic", help="Another robot's command: Twist, TwistStamped or AckermannDrive(Stamped).")
 @click.option("--reference-topic", help="Another robot's reference: Odometry or Path.")
 @click.option("--track-file", type=click.Path(path_type=Path), help="Another robot's reference: CSV file with t, v, w.")
@@ -34,9 +35,9 @@ from agv_analysis.commands import (
 @with_report
 def command(
     bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None,
-    pose_topic: str | None, command_topic: str | None, reference_topic: str | None, track_file: Path | None,
-    topics: Path | None, report: Path | None, figures: Path | None, corridor_width: float | None,
-    corridor_along: float | None, laps: int | None,
+    pose_topic: str | None, pose_frames: tuple[str, str] | None, command_topic: str | None,
+    reference_topic: str | None, track_file: Path | None, topics: Path | None, report: Path | None,
+    figures: Path | None, corridor_width: float | None, corridor_along: float | None, laps: int | None,
 ) -> None:  # fmt: skip
     """Say from the recording BAG whether the loop is stable, and why.
 
@@ -62,7 +63,7 @@ def command(
         if namespace is not None:
             raise click.UsageError("--namespace chooses one of several loops; another robot's topics are named in full")
         names = read_topics(topics, pose_topic, command_topic, reference_topic)
-        run = read_robot_run(bag, names, track_file, config)
+        run = read_robot_run(bag, names, track_file, config, pose_frames)
     else:
         run = read_run(bag, config, namespace)
     analysis = analyse(run) if run.gains_known else observe(run)

@@ -22,6 +22,7 @@ from agv_analysis.recordings.robot_reference import read_reference
 from agv_analysis.recordings.robot_timing import with_timing
 from agv_analysis.recordings.robot_topics import RobotTopics
 from agv_analysis.recordings.sampling import sampling_notes, sampling_of
+from agv_analysis.recordings.transform_poses import STATIC, TRANSFORMS, read_transforms
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.parameters import CSV
@@ -34,19 +35,30 @@ from agv_ros.stamps import NS_PER_S, to_nanoseconds
 __all__ = ["RobotTopics", "read_robot_run"]
 
 
-def read_robot_run(path: Path, topics: RobotTopics, track_file: Path | None = None, config: Path | None = None) -> Run:
+def read_robot_run(
+    path: Path, topics: RobotTopics, track_file: Path | None = None, config: Path | None = None,
+    pose_frames: tuple[str, str] | None = None,
+) -> Run:  # fmt: skip
     """Run of a robot that is recorded in a rosbag2 directory, an MCAP or a sqlite3 file.
 
     The reference is that of `topics`, else the speeds of `track_file` (columns t, v, w; t = 0 at the first pose), else
-    the track of `config`, a params file. Without `config` the gains are unknown. At lost poses the run has what lies
+    the track of `config`, a params file. Without `config` the gains are unknown. Of transforms `pose_frames` names the
+    fixed frame and the robot's. At lost poses the run has what lies
     between those that came. Raises UserError if the bag cannot be read or does not hold what was named.
     """
     if topics.reference is not None and track_file is not None:
         raise UserError(f"two references, the topic {topics.reference} and the file {track_file}: name one of them")
     if topics.reference is None and track_file is None and config is None:
         raise UserError("no reference: name its topic with --reference-topic, or a track with --track-file or --config")
-    bag = read_bag(path, topics=[name for name in topics if name is not None])
-    poses = read_poses(bag, topics.pose)
+    named = [name for name in topics if name is not None]
+    bag = read_bag(path, topics=named)
+    if topics.pose in bag.topics and bag.topics[topics.pose].type == TRANSFORMS:
+        if pose_frames is None:
+            raise UserError(f"{path}: {topics.pose} has transforms: name frames, as with --pose-frames map base_link")
+        bag = read_bag(path, topics=[*named, *([STATIC] if STATIC in bag.topics else [])])
+        poses = read_transforms(bag, topics.pose, *pose_frames)
+    else:
+        poses = read_poses(bag, topics.pose)
     target = None if topics.reference is None else read_reference(bag, topics.reference, poses)
     return _run(bag, topics, poses, target, _scenario(track_file, config), config)
 

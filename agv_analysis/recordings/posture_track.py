@@ -84,12 +84,12 @@ def read_poses(bag: Bag, topic: str, what: str = "pose") -> Track:
     return in_order(everything, f"{bag.path}: {topic}", topic)
 
 
-def yaws_of(messages: NDArray[np.void], path: str) -> Floats:
+def yaws_of(messages: NDArray[np.void], path: str, member: str = "orientation") -> Floats:
     """Yaw [rad] in (-pi, pi]; NaN where the quaternion is no rotation, as one whose w was never set.
 
-    Shape as that of the components.
+    It is the `member` of what is at `path`. Shape as that of the components.
     """
-    components = [messages[f"{path}.orientation.{axis}"] for axis in "xyzw"]
+    components = [messages[f"{path}.{member}.{axis}"] for axis in "xyzw"]
     yaws = [yaw_of_quaternion(*q) for q in zip(*(part.ravel().tolist() for part in components), strict=True)]
     with np.errstate(over="ignore", invalid="ignore"):
         squared = sum(part**2 for part in components)

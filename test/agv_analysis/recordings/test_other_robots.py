@@ -287,6 +287,43 @@ def test_reference_from_a_track_file(tmp_path: Path, truth: Run) -> None:
     assert_is_the_truth(read_robot_run(bag, topics, None, config), truth, 1e-8)
 
 
+def transform(stamp: int, parent: str, child: str, x: float, y: float, theta: float) -> Any:
+    where = make("geometry_msgs/msg/Transform", translation=vector(x, y), rotation=posture(0, 0, theta).orientation)
+    one = make(
+        "geometry_msgs/msg/TransformStamped", header=header(stamp, parent), child_frame_id=child, transform=where
+    )
+    return make("tf2_msgs/msg/TFMessage", transforms=[one])
+
+
+def test_the_pose_from_transforms_is_that_of_odometry(tmp_path: Path, truth: Run) -> None:
+    """The truth as base_link in odom, which lies turned and moved in map; and a laser that is fixed to the robot."""
+    made = recording(truth)
+    made.messages = [entry for entry in made.messages if entry[0] != "/tf"]
+    map_to_odom, cos, sin = (3.0, -1.0, 0.7), np.cos(0.7), np.sin(0.7)
+    made.add("/tf_static", START - 1, transform(START - 1, "base_link", "laser", 0.2, 0.0, 0.1))
+    for k, received in enumerate(~truth.lost):
+        stamp = START + k * TS
+        if k % 10 == 0:
+            made.add("/tf", stamp + LOG - 1, transform(stamp, "map", "odom", *map_to_odom))
+        if received:
+            made.add("/tf", stamp + LOG, transform(stamp, "odom", "base_link", *truth.pose[k]))
+    bag = made.write(tmp_path / "bag")
+    topics = ALL._replace(pose="/tf")
+    assert_is_the_truth(read_robot_run(bag, topics, pose_frames=("odom", "base_link")), truth)
+    run, laser = (read_robot_run(bag, topics, pose_frames=("map", frame)) for frame in ("base_link", "laser"))
+    came, n = ~run.lost, len(run)
+    x, y, theta = truth.pose[:n].T
+    expected = np.column_stack([3.0 + cos * x - sin * y, -1.0 + sin * x + cos * y])
+    np.testing.assert_allclose(run.pose[came, :2], expected[came], atol=1e-9)
+    np.testing.assert_allclose(wrapped(run.pose[came, 2] - theta[came] - 0.7), 0.0, atol=1e-9)
+    ahead = 0.2 * np.column_stack([np.cos(run.pose[:, 2]), np.sin(run.pose[:, 2])])
+    np.testing.assert_allclose(laser.pose[came, :2], (run.pose[:, :2] + ahead)[came], atol=1e-9)
+    with pytest.raises(UserError, match="camera has no parent on the way up to map; there are base_link to laser"):
+        read_robot_run(bag, topics, pose_frames=("map", "camera"))
+    with pytest.raises(UserError, match="--pose-frames map base_link"):
+        read_robot_run(bag, topics)
+
+
 def test_a_track_file_that_is_shorter_ends_the_run(tmp_path: Path, truth: Run) -> None:
     bag, track = recording(truth, reference="none").write(tmp_path / "bag"), track_file(tmp_path / "track.csv", truth)
     rows = track.read_text().splitlines()
