@@ -65,13 +65,16 @@ class Input:
         self._told: set[str] = set()
         self._is_chosen = f"qos_overrides.{self.topic}.subscription.reliability" in node._parameter_overrides
         self._is_best_effort = False
+        self._is_due = True
+        """May there be an offer that has not been looked at? To look all the time would cost a loop too much."""
         self._subscription: Subscription | None = None
         self._subscribe()
         self.look()
+        self._is_due = False
 
     def look(self) -> None:
         """Hear publishers that have appeared meanwhile and offer best effort."""
-        if self._is_chosen or self._is_best_effort:
+        if self._is_chosen or self._is_best_effort or not self._is_due:
             return
         offer = offer_of(self._node, self.topic)
         if offer is not None and not offer.is_reliable:
@@ -105,6 +108,7 @@ class Input:
     def _on_incompatible(self, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
         if policy == "reliability" and not self._is_chosen:  # mended as soon as it is known what is offered
+            self._is_due = True
             return
         if policy not in self._told:
             self._told.add(policy)
