@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -34,8 +35,8 @@ SPIN_TIMEOUT = 0.05
 
 _ROSOUT_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-_ROSOUT_PATIENCE = 0.5
-"""How long [s] a process that fails looks for those who watch /rosout."""
+_ROSOUT_PATIENCE = 3.2
+"""How long [s] a process that fails looks for those who watch /rosout: DDS finds some only when it repeats itself."""
 
 LAST_FLUSH_TIMEOUT = 10.0
 """How long [s] a node that finishes normally waits for subscribers that lag."""
@@ -142,11 +143,13 @@ def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = No
         try:
             failure = failure or _run(make, stop)
             if failure:
-                _say_on_rosout(make.__name__, failure)
+                print(failure, file=sys.stderr, flush=True)
+                # Who stops a run, or has started it with others, knows why it ended, and waits for nothing.
+                if not (stop.requested or os.environ.get(ENDS_WITH_STDIN)):
+                    _say_on_rosout(_usual_name(make), failure, stop)
         finally:
             rclpy.try_shutdown()
     if failure:
-        print(failure, file=sys.stderr)
         raise SystemExit(1)
 
 
@@ -169,12 +172,17 @@ def params_files_in(words: Sequence[str]) -> list[str]:
     return [path for flag, path in pairwise(words) if flag == "--params-file"]
 
 
-def _say_on_rosout(name: str, failure: str) -> None:
-    """Say on /rosout why this node ends; it may never have been made. Waits for subscribers for a moment only."""
-    herald = Node(f"{name.lower()}_failure", enable_rosout=False, start_parameter_services=False)
+def _usual_name(make: Callable[..., LoopNode[Any]]) -> str:
+    """What a node is called that may never have been made: ErrorDetectorNode is error_detector."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", make.__name__.removesuffix("Node")).lower()
+
+
+def _say_on_rosout(name: str, failure: str, stop: Stop) -> None:
+    """Say on /rosout why a node ends; it waits for subscribers for a moment only."""
+    herald = Node(f"{name}_failure", enable_rosout=False, start_parameter_services=False)
     publisher = herald.create_publisher(Log, "/rosout", _ROSOUT_QOS)
     deadline = time.monotonic() + _ROSOUT_PATIENCE
-    while not publisher.get_subscription_count() and time.monotonic() < deadline:
+    while not (publisher.get_subscription_count() or stop.requested) and time.monotonic() < deadline:
         time.sleep(0.01)
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     stamp = TimeMessage(sec=seconds, nanosec=nanoseconds)

@@ -822,7 +822,7 @@ def test_a_node_that_cannot_start_says_so_in_one_line_and_on_rosout(
     logged: list[Any] = []
     lone_bench.probe.create_subscription(Log, "/rosout", logged.append, 10)
     node = start("agv_cloud.controller_node", "--ros-args", *arguments)
-    lone_bench.until(lambda: any(entry.msg == said for entry in logged))
+    lone_bench.until(lambda: any((entry.name, entry.msg) == ("controller", said) for entry in logged))
     status, output = node.end()
     assert (status, output.splitlines()) == (1, [said])
 
