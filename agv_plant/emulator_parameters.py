@@ -20,8 +20,8 @@ class DirectionParameters(ChannelParameters):
 
     topics: tuple[str, ...] = parameter(
         ("",),
-        "topics of any type that cross it, as [/scan, /odom]; /scan:=/edge/scan also says what it is called on the "
-        'other side; [""]: none',
+        'topics of any type that cross it, as [/scan, /odom]; "/scan:=/edge/scan", in quotes, also says what it is '
+        'called on the other side; [""]: none',
     )
     prefix: str = parameter(
         "",

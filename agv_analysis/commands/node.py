@@ -19,7 +19,7 @@ def command(name: str, arguments: tuple[str, ...]) -> None:
     \b
     Examples:
       agv-ncs node relay --ros-args --params-file config/outages.yaml
-      agv-ncs node link_emulator --ros-args -p uplink.topics:=[/scan] -p uplink.model:=bernoulli -p uplink.p:=0.1
+      agv-ncs node link_emulator --ros-args -p uplink.topics:='[/scan]' -p uplink.model:=bernoulli -p uplink.p:=0.1
       agv-ncs node recorder --ros-args -p bag:=bags/first -p params_file:=config/outages.yaml
     """
     with needs_ros():

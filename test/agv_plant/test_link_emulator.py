@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import re
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -303,6 +305,23 @@ def test_without_any_topic_it_says_how_to_name_some(start: Callable[..., Any], t
     status, said = start("agv_plant.link_emulator_node").end()
     assert status == 1
     assert said.splitlines()[-1].startswith("no topic crosses the link: name some, as in -p uplink.topics:=[/scan]")
+
+
+def test_the_commands_of_the_page_start_an_emulator() -> None:
+    """Each as a shell and ROS read it; their quotes are easily wrong."""
+    page = (Path(__file__).parents[2] / "docs/link_emulator.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^    ros2 run agv_ncs link_emulator ((?:.*\\\n)*.*)$", page, re.MULTILINE)
+    assert len(blocks) == 3
+    for block in blocks:
+        words = shlex.split(block.replace("\\\n", " "))
+        context = rclpy.Context()
+        rclpy.init(args=words, context=context)
+        node = LinkEmulatorNode(context=context)
+        crossing = [(topic.heard, topic.called) for topic in node.topics]
+        node.destroy_node()
+        context.try_shutdown()
+        assert crossing[0] in (("/scan", "/edge/scan"), ("/camera/image_raw", "/edge/camera/image_raw"))
+        assert len(crossing) == 1 or crossing[-1] == ("/edge/cmd_vel", "/cmd_vel")
 
 
 def test_a_trace_with_times_needs_slots_that_have_a_length(radio: Make, tmp_path: Path) -> None:
