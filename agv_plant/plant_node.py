@@ -26,6 +26,7 @@ from agv_plant.vehicle.motion import NOISE, SLIP, Motion, measured, move, vehicl
 from agv_plant.vehicle.registry import VEHICLES
 from agv_plant.zero_order_hold import ZeroOrderHold
 from agv_ros.codec import decode_command, decode_slot, encode_clock, encode_pose, stamp_of
+from agv_ros.endpoints import RECORDER
 from agv_ros.executor import run_node
 from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.messages import FRAME_AGV, Command, InvalidMessageError, StampedPose
@@ -45,6 +46,9 @@ _REPEAT_AFTER, _REPEAT_AFTER_WAITING = 0.5, 4.0
 Later where this node has waited for subscribers, who may yet have been others than its peers: a busy machine alone
 shall not make a run differ, and what DDS itself has lost it brings after 3 s.
 """
+
+_FOUND_BY_ALL = 3.2
+"""Time [s] by which a node is found by all others: what DDS has lost of its announcements it repeats after 3 s."""
 
 _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_vel", "controller"))
 """A topic that each peer publishes, in the order in which a step passes them."""
@@ -97,6 +101,7 @@ class PlantNode(LoopNode[PlantParameters]):
             self.input(MultiDOFJointTrajectory, "agv/plan", self._on_plan)
         else:
             self.input(TwistStamped, "agv/cmd_vel", self._on_command)
+        self._may_begin = 0.0
         self._begin_by = time.monotonic() + settings.start_timeout
         self.poll(self._begin)
 
@@ -117,6 +122,8 @@ class PlantNode(LoopNode[PlantParameters]):
             if time.monotonic() > self._begin_by:
                 self.fail(self._not_begun(wanted))
             return self.finished
+        if self.settings.wait_for_subscribers == 1 and self._waits_for_recorder():
+            return False
         if rivals := [f"another {node} publishes {topic}" for topic, node in _ONCE if self._publishers_of(topic) > 1]:
             remap = ", with -r /clock:=clock -r /diagnostics:=diagnostics," if "/clock" in " ".join(rivals) else ""
             self.fail(f"{', '.join(rivals)}: use another namespace{remap} or ROS_DOMAIN_ID")
@@ -126,6 +133,13 @@ class PlantNode(LoopNode[PlantParameters]):
         else:
             self._keep_time()
         return True
+
+    def _waits_for_recorder(self) -> bool:
+        """May a recorder that is there not have been found yet by all nodes? Then the loop begins a little later."""
+        if RECORDER not in self.get_node_names():
+            return False
+        self._may_begin = self._may_begin or time.monotonic() + _FOUND_BY_ALL
+        return time.monotonic() < self._may_begin
 
     def _publishers_of(self, topic: str) -> int:
         """How many nodes publish what this node calls `topic`."""

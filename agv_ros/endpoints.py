@@ -18,7 +18,10 @@ from agv_ros.stamps import to_nanoseconds
 # Only copies of it are used: rclpy writes a topic's overrides into the profile that it is given.
 LOOP_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
 
-_RECORDERS = ("recorder", "rosbag2_recorder")
+RECORDER = "recorder"
+"""Usual name of the node that records a loop."""
+
+_RECORDERS = (RECORDER, "rosbag2_recorder")
 """Names of nodes that only record: one of them alone is no reason for a loop to begin."""
 
 
