@@ -175,6 +175,13 @@ def test_pip_users_start_nodes_by_the_one_command(agv_ncs: Callable[..., tuple[i
     assert "Traceback" not in said
 
 
+def test_help_of_a_node_is_the_nodes(agv_ncs: Callable[..., tuple[int, str]]) -> None:
+    status, said = agv_ncs("node", "link_emulator", "--help")
+    assert (status, said.splitlines()[0]) == (
+        0, "link_emulator: A radio link for topics of any type: loses, delays or doubles their messages, reproducibly.",
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("name", NODE_MODULES)
 def test_old_names_stand_for_one_more_release_and_say_so(name: str, tmp_path: Path) -> None:
     point = next(one for one in metadata.entry_points(group="console_scripts") if one.name == name)
