@@ -42,7 +42,8 @@ def command(out: Path, ros: bool) -> None:
         raise UserError(f"{out}: cannot be made: {error.strerror}") from None
     runs = _runs(out, ros)
     with Console(stderr=True).status("driving the paper's runs ..."):
-        for figure in figures(runs):
+        drawn = list(figures(runs))
+        for figure in drawn:
             write(figure, out)
         findings = [check(claim, runs) for claim in CLAIMS]
     report.print_claims(findings)
@@ -53,6 +54,8 @@ def command(out: Path, ros: bool) -> None:
     for table in found:
         report.print_table(table)
     report.write(findings, found, "recorded runs" if ros else "simulation", out)
+    for figure in drawn:
+        click.echo(f"{out / figure.name}.svg: {figure.where}")
     click.echo(f"figures and tables: {out}")
 
 

@@ -43,21 +43,30 @@ class Figure:
     """Are both axes of the same scale?"""
     linear_to: float = math.inf
     """Size beyond which the y axis is logarithmic."""
+    where: str = ""
+    """Which figure of the paper it is, and its caption; in the title of the files."""
 
 
 def figures(runs: Runs) -> Iterator[Figure]:
     """The figures of the paper, in its order."""
     reference = runs.run(*gain(GAINS[0])).reference
-    yield Figure("track", "x [m]", "y [m]", {"X_r": (reference[:, 0], reference[:, 1])}, is_map=True)
+    curve = {"X_r": (reference[:, 0], reference[:, 1])}
+    yield Figure("track", "x [m]", "y [m]", curve, is_map=True, where="Fig. 2a: AGV reference track")
     time = runs.run(*gain(GAINS[0])).time
-    yield Figure("reference_speed", "time [s]", "v_r [m/s]", {"v_r": (time, reference[:, 3])})
-    for name, v_max in (("unlimited", math.inf), ("limited", LIMIT)):
+    curve = {"v_r": (time, reference[:, 3])}
+    yield Figure("reference_speed", "time [s]", "v_r [m/s]", curve, where="Fig. 2b: reference translational velocity")
+    for name, v_max, letters in (("unlimited", math.inf, "abc"), ("limited", LIMIT, "def")):
+        tracks_of, error_of, speed_of = (f"Fig. 3{letter}: " for letter in letters)
         by_gain = {f"K_x = {kx:g}": runs.run(*gain(kx, v_max)) for kx in GAINS}
         tracks = {label: (run.pose[:, 0], run.pose[:, 1]) for label, run in by_gain.items()}
-        yield Figure(f"{name}_tracks", "x [m]", "y [m]", tracks, is_map=True)
-        yield Figure(f"{name}_y_error", "step k", "y_r - y_c [m]", _begin(by_gain, _y_error))
+        yield Figure(f"{name}_tracks", "x [m]", "y [m]", tracks, is_map=True, where=f"{tracks_of}tracks, {name} speed")
+        errors = _begin(by_gain, _y_error)
+        of_error = f"{error_of}error in y, {name} speed"
+        yield Figure(f"{name}_y_error", "step k", "y_r - y_c [m]", errors, where=of_error)
         speeds = _begin(by_gain, lambda run: run.command[:, 0])
-        yield Figure(f"{name}_speed", "step k", "v [m/s]", speeds, linear_to=10.0 if math.isinf(v_max) else math.inf)
+        linear_to = 10.0 if math.isinf(v_max) else math.inf
+        of_speed = f"{speed_of}translational velocity, {name}"
+        yield Figure(f"{name}_speed", "step k", "v [m/s]", speeds, linear_to=linear_to, where=of_speed)
 
 
 def _y_error(run: Run) -> Floats:
@@ -86,8 +95,8 @@ def write(figure: Figure, folder: Path) -> None:
         if len(figure.curves) > 1:
             axes.legend()
         try:
-            canvas.savefig(folder / f"{figure.name}.svg", metadata={"Date": None})
-            canvas.savefig(folder / f"{figure.name}.png", dpi=300)
+            canvas.savefig(folder / f"{figure.name}.svg", metadata={"Date": None, "Title": figure.where})
+            canvas.savefig(folder / f"{figure.name}.png", dpi=300, metadata={"Title": figure.where})
             _write_csv(figure, folder / f"{figure.name}.csv")
         except OSError as error:
             raise UserError(f"{folder / figure.name}: cannot be written: {error.strerror}") from None

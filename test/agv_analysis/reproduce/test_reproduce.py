@@ -394,13 +394,16 @@ def test_values_as_people_read_them(value: Any, text: str) -> None:
 def test_figures_are_a_column_wide_and_carry_their_data(tmp_path: Path) -> None:
     runs = simulated()
     drawn = list(figures(runs))
-    assert len(drawn) == 8
+    assert [figure.where.partition(":")[0] for figure in drawn] == [
+        "Fig. 2a", "Fig. 2b", *(f"Fig. 3{letter}" for letter in "abcdef")
+    ]  # fmt: skip
     figure = next(figure for figure in drawn if figure.name == "limited_speed")
     write(figure, tmp_path)
     width, _ = struct.unpack(">II", (tmp_path / "limited_speed.png").read_bytes()[16:24])
     assert width == 1050  # 3.5 in at 300 dots an inch
     root = ElementTree.parse(tmp_path / "limited_speed.svg").getroot()
     assert root.attrib["width"] == "252pt"
+    assert "Fig. 3f: translational velocity, limited" in (tmp_path / "limited_speed.svg").read_text()
     assert not root.findall(".//{http://www.w3.org/2000/svg}text"), "letters are paths"
     rows = list(csv.reader((tmp_path / "limited_speed.csv").open()))
     assert [float(row[1]) for row in rows[1:]] == runs.run(*gain(5.0, 6.0)).command[: len(rows) - 1, 0].tolist()
