@@ -14,6 +14,7 @@ from agv_analysis.commands import corridor_settings, write_json
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from agv_analysis.link.formats.format import Options
     from agv_analysis.link.link_figures import DirectionFigures, LinkFigures, Spread
     from agv_analysis.link.measurement import LossRates, Measurement, Reading, Setting
     from agv_analysis.scenario import Scenario
@@ -66,7 +67,7 @@ def command(
 
     scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
     options = Options(interval, dict(map(_column, columns)), topic, received)
-    reading = _read(file, options, name or "")
+    reading = read_file(file, options, name or "")
     console = Console(highlight=False)
     if isinstance(reading, Setting):
         found = _setting(console, reading, scenario)
@@ -87,8 +88,8 @@ def _column(text: str) -> tuple[str, str]:
     return role, name
 
 
-def _read(file: Path, options: Any, name: str) -> Reading:
-    """Read a file, a long one under a progress bar."""
+def read_file(file: Path, options: Options, name: str = "") -> Reading:
+    """Read a measured link, a long file under a progress bar. Raises MeasurementError for one that is none."""
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.link.formats import read_link
     from agv_analysis.link.formats.netem_line import setting

@@ -92,7 +92,7 @@ def command(
     console = Console(highlight=False)
     with Console(stderr=True).status("computing what the loop asks ..."):
         loop = require(scenario)
-        link = _link_of(scenario, loop, file, interval)
+    link = _link_of(scenario, loop, file, interval)  # which may have a progress bar of its own
     enough = {one.name: would_do(one, loop) for one in classes}
     met = {one.name: meets(one, link) for one in classes}
     sections: dict[str, list[tuple[str, ...]]] = {"What the loop asks of its radio": list(rows_of_loop(loop))}
@@ -144,7 +144,7 @@ def _link_of(
     scenario: Scenario, loop: LoopRequirements, file: Path | None, interval: float | None
 ) -> LinkAvailability | None:
     """What the measured link gives, or the scenario's uplink; None where nothing is known of it, or of the loop."""
-    from agv_analysis.link.formats import read_link
+    from agv_analysis.commands.link import read_file
     from agv_analysis.link.formats.format import Options
     from agv_analysis.link.link_figures import LinkFigures
     from agv_analysis.link.markov_channel import chain_of
@@ -156,7 +156,7 @@ def _link_of(
     slots = loop.survival_slots
     uplink = scenario.relay.uplink
     if file is not None:
-        reading = read_link(file, Options(interval))
+        reading = read_file(file, Options(interval))
         if isinstance(reading, LossRates):
             raise UserError(reading.refusal)
         if isinstance(reading, Measurement):
