@@ -4,7 +4,7 @@ settings             what is on the page as a scenario
 sliders, positions   what can be moved, and which value a position is
 response             the lap of a scenario as figures and numbers, at once
 background_criteria  what takes longer
-layout               what is where
+page_layout          what is where
 app                  the page, and its answers
 guard                who may ask
 """

@@ -20,7 +20,7 @@ from agv_analysis.explore.background_criteria import (
     tube_traces,
 )
 from agv_analysis.explore.guard import check_request, guard, said
-from agv_analysis.explore.layout import SHOWN_FOR_A_LAW, STYLE, layout, styles_of
+from agv_analysis.explore.page_layout import SHOWN_FOR_A_LAW, STYLE, layout, styles_of
 from agv_analysis.explore.positions import difference, from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, Values, preset_values, scenario_of, values_of

@@ -376,7 +376,7 @@ def test_a_law_brings_its_own_sliders(page: Page) -> None:
     def shown() -> list[str]:
         return [key for key in SHOWN_FOR_A_LAW if page.chrome.find_element("id", key).is_displayed()]
 
-    from agv_analysis.explore.layout import SHOWN_FOR_A_LAW
+    from agv_analysis.explore.page_layout import SHOWN_FOR_A_LAW
 
     assert shown() == ["gains-of-kanayama"]
     choose(page, "law", "pure_pursuit")
