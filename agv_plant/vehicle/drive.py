@@ -59,5 +59,5 @@ def smooth_acceleration(wanted: float, missing: float, a_before: float, dt: floa
     change, distance = max(j_max * dt, _LEAST_CHANGE), abs(missing)
     m = math.floor(min(_MOST_STEPS, 0.5 * (math.sqrt(1.0 + 8.0 * (distance / dt) / change) - 1.0)))
     largest = (distance / dt + 0.5 * change * m * (m + 1)) / (m + 1)
-    a = math.copysign(min(abs(wanted), largest), missing)
+    a = min(max(wanted, -largest), largest)  # not by its modulus, which has no derivative at a steady speed
     return min(max(a, a_before - change), a_before + change)

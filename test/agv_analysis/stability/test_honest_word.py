@@ -295,6 +295,20 @@ def test_a_limit_below_the_reference_s_speed_is_one_thing_on_all_closed_tracks()
         assert f"even without losses it drives up to {found.evidence.beside_reference:.3g} m" in found.verdict.reason
 
 
+def test_a_limit_on_the_jerk_does_not_unsettle_a_steady_speed() -> None:
+    """A circle of 200 m at 2 m/s, driven at 1.6: it settles on one of 160 m, 18.2 m behind its reference, slowly."""
+    slow = (
+        "error_detector.track=circle", "error_detector.speed=2.0", "controller.v_max=1.6", "controller.kx=0.65",
+        "controller.ky=0.56", "controller.ktheta=0.64", "plant.a_max=2.0", "plant.j_max=20.0", "plant.lag=0.3",
+    )  # fmt: skip
+    run = simulate(scenario_of(*slow, "plant.duration=600.0"))
+    away = np.hypot(*(run.pose - run.reference[:, :3])[-20_000:, :2].T)
+    assert np.ptp(away) < 1e-3
+    found = evidence_of_scenario(scenario_of(*slow))
+    assert decide(found).word == "asymptotic"
+    assert found.beside_reference == pytest.approx(away.mean(), abs=1e-3)
+
+
 def test_a_limit_of_just_the_reference_s_speed_never_makes_up_for_what_was_lost() -> None:
     assert of(LINE, "controller.v_max=1.0").verdict.word == "bounded"
     assert of(LINE, "controller.v_max=1.05").verdict.word == "asymptotic"
