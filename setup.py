@@ -14,7 +14,7 @@ EXTRAS = {
     "bags": ["isal>=1.1", "lz4>=4.0", "mcap>=1.6", "rosbags>=0.10.9", "zstandard>=0.18"],
     # Pictures and the page for the browser.
     "report": ["jinja2>=3.0", "matplotlib>=3.6", "plotly>=6.0"],
-    # The page of `agv-ncs explore`.
+    # The pages of `agv-ncs explore` and `agv-ncs watch`.
     "explore": ["dash>=3.0", "flask>=2.2", "plotly>=6.0", "werkzeug>=3.0"],
     # Sweeps on a Dask cluster, and results as Parquet.
     "cluster": ["distributed>=2023.1"],
@@ -43,6 +43,7 @@ setup(
         "agv_ros": ["py.typed", "loopback.xml"],
         "agv_analysis.report": ["*.j2"],
         "agv_analysis.requirements": ["*.yaml"],
+        "agv_analysis.watch": ["*.html"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

@@ -13,7 +13,7 @@ import click
 
 COMMANDS = (
     "run", "analyse", "stability", "channel", "link", "probe", "require", "parameters", "simulate", "explore", "sweep",
-    "bag", "replay", "reproduce", "node", "doctor",
+    "bag", "replay", "reproduce", "node", "doctor", "watch",
 )  # fmt: skip
 
 

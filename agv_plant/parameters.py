@@ -255,7 +255,8 @@ class ChannelParameters:
     schedule: str = parameter(
         "",
         "what changes in a run, as in '20: p=0.1; 20: outage=0.3 every 5; 60: outage=0': from 20 s on p is 0.1 and all "
-        "is lost for 0.3 s every 5 s, from 60 s on no more; takes any parameter that changes at run time",
+        "is lost for 0.3 s every 5 s, from 60 s on no more; takes any number that changes at run time",
+        runtime=True,
     )
     arguments: tuple[float, ...] = parameter(
         (0.0,), "a model of another package: whatever numbers it takes", any_length=True, runtime=True
@@ -348,7 +349,7 @@ class RelayParameters(TwoDomains):
 _CHANGEABLE = {
     name: found
     for name, found in parameters_of(ChannelParameters).items()
-    if found.runtime and found.kind != "double_array"
+    if found.runtime and found.kind in ("double", "integer")
 }
 """What a schedule may change."""
 

@@ -24,6 +24,9 @@ RECORDER = "recorder"
 _RECORDERS = (RECORDER, "rosbag2_recorder")
 """Names of nodes that only record: one of them alone is no reason for a loop to begin."""
 
+WATCHER = "watcher"
+"""Name of the node behind the page of `agv-ncs watch`: a loop begins, and goes on, as if it were not there."""
+
 
 class Output:
     """A publisher of serialised messages that counts them."""
@@ -44,17 +47,25 @@ class Output:
     def is_heard(self, subscribers: int) -> bool:
         """Has the topic this many subscribers? One fewer is enough beside the loop: only a recorder listens there.
 
-        A single one must not be a recorder, and an optional topic does without it.
+        A single one must not be a recorder, and an optional topic does without it. Watchers do not count.
         """
-        count = self._publisher.get_subscription_count()
         if self._side or subscribers != 1:
-            return bool(count >= subscribers - self._side)
-        return self._optional or (count > 0 and self._is_heard_by_a_peer())
+            return self._is_counted(subscribers - self._side)
+        return self._optional or (self._publisher.get_subscription_count() > 0 and self._is_heard_by_a_peer())
+
+    def _is_counted(self, wanted: int) -> bool:
+        """Are there this many subscribers whose names are known, watchers left out?"""
+        if self._publisher.get_subscription_count() < wanted or wanted <= 0:
+            return wanted <= 0
+        return sum(name != WATCHER for name in self._names_of_subscribers()) >= wanted
 
     def _is_heard_by_a_peer(self) -> bool:
+        return any(name not in (*_RECORDERS, WATCHER) for name in self._names_of_subscribers())
+
+    def _names_of_subscribers(self) -> list[str]:
         infos = self._where.get_subscriptions_info_by_topic(self.topic)
         # A name that begins with _ is one that is not known yet.
-        return any(not info.node_name.startswith("_") and info.node_name not in _RECORDERS for info in infos)
+        return [info.node_name for info in infos if not info.node_name.startswith("_")]
 
     def rivals(self) -> list[str]:
         """Names of other nodes that publish what one node of a loop alone should; none beside the loop."""

@@ -30,7 +30,7 @@ NEEDED_BY_OTHERS = {"setuptools": "colcon builds by it"}
 ROOMS = {
     "bags": ("agv_analysis/bags/",),
     "report": ("agv_analysis/report/", "agv_analysis/reproduce/", "agv_analysis/sweep/", "agv_analysis/link/"),
-    "explore": ("agv_analysis/explore/",),
+    "explore": ("agv_analysis/explore/", "agv_analysis/watch/"),
     "cluster": ("agv_analysis/sweep/execute.py",),
     "parquet": ("agv_analysis/sweep/rows_file.py", "agv_analysis/bags/export.py"),
     "captures": ("agv_analysis/link/formats/capture.py",),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,6 +45,9 @@ PITCH = 20.0
     "--corridor", type=click.FloatRange(min=0.0, min_open=True), metavar="D",
     help="The AGV should stay within D [m] of its reference: recorded for `analyse`, and how much of it a fleet uses.",
 )  # fmt: skip
+@click.option("--live", is_flag=True, help="Serve a page in the browser that shows the run while it goes on.")
+@click.option("--host", default="127.0.0.1", show_default=True, help="--live: address to serve the page on.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8051, show_default=True, help="--live: 0: any free one.")
 @click.option("--pitch", type=float, default=PITCH, show_default=True, help="Fleet: distance between tracks [m].")
 def command(
     params: str,
@@ -57,6 +62,9 @@ def command(
     fleet: int | None,
     corridor: float | None,
     pitch: float,
+    live: bool,
+    host: str,
+    port: int,
 ) -> None:
     """Run the loop of the params file PARAMS on DDS, or a fleet of such loops.
 
@@ -68,6 +76,7 @@ def command(
       agv-ncs run config/paper.yaml
       agv-ncs run config/outages.yaml --bag bags/first --seed 7
       agv-ncs run config/paper.yaml --clock realtime --processes --duration 10
+      agv-ncs run config/outages.yaml --clock realtime --live
       agv-ncs run config/paper.yaml --set relay.uplink.blocks=2 --fleet 8 --bag bags/fleet
     """
     from agv_analysis.scenario import load_scenario
@@ -76,6 +85,8 @@ def command(
     given = [f"{name}={value}" for name, value in shorthands.items() if value is not None]
     scenario = load_scenario(params, (*settings, *given, *corridor_settings(corridor, None)))
     if fleet is not None:
+        if live:
+            raise click.UsageError("--live shows one loop: watch one of a fleet with agv-ncs watch --namespace agv_01")
         _run_fleet(scenario, fleet, pitch, bag, processes, (fsync, if_unwritable))
         return
     with needs_ros():
@@ -86,7 +97,10 @@ def command(
     from agv_ros.discovery import discovery_note
 
     click.echo(discovery_note(), err=True)
-    with step_bar(scenario.plant.duration / scenario.plant.ts) as progress:
+    with (
+        _watched(scenario, host, port) if live else nullcontext(),
+        step_bar(scenario.plant.duration / scenario.plant.ts) as progress,
+    ):
         run = run_in_processes if processes else run_in_process
         outcome = run(scenario, bag, progress, on_disk=OnDisk(fsync, if_unwritable))
     click.echo(f"{outcome.steps} steps" + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
@@ -95,6 +109,19 @@ def command(
     failures = dict.fromkeys(failure for failure in (outcome.failure, outcome.recording_failure) if failure)
     if failures:
         raise click.ClickException("; ".join(failures))
+
+
+@contextmanager
+def _watched(scenario: Scenario, host: str, port: int) -> Iterator[None]:
+    """With the page of a run, in a process beside it."""
+    from agv_analysis.runtime.run_setup import params_file
+    from agv_analysis.watch.beside_run import watcher_beside
+
+    def ready(address: str) -> None:
+        click.echo(f"live: {address}", err=True)
+
+    with params_file(scenario) as params, watcher_beside(scenario, params, host, port, ready):
+        yield
 
 
 def _run_fleet(

@@ -8,6 +8,7 @@ it, and if the browser says which page it comes from, that must be ours.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,17 @@ _HEADERS = {
 }  # fmt: skip
 
 
-def guard(server: Any, port: int) -> None:
-    """Let a Flask server answer to pages of its own alone, on this port, and to requests of a bounded size."""
+THIS_HOST = ("127.0.0.1", "localhost")
+
+
+def guard(server: Any, port: int, names: Sequence[str] = THIS_HOST) -> None:
+    """Let a Flask server answer to pages of its own alone, on this port, and to requests of a bounded size.
+
+    `names` are those by which a request may call this host.
+    """
     flask: Any = importlib.import_module("flask")
     errors: Any = importlib.import_module("werkzeug.exceptions")
-    hosts = {f"{name}:{port}" for name in ("127.0.0.1", "localhost")}
+    hosts = {f"{name}:{port}" for name in names}
     origins = {f"http://{host}" for host in hosts}
     server.config["MAX_CONTENT_LENGTH"] = MOST_BYTES
 

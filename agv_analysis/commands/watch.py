@@ -1,0 +1,51 @@
+"""`agv-ncs watch`: a page beside a running loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from agv_analysis.commands import needs_ros
+
+
+@click.command("watch")
+@click.option("--namespace", default="", help="Which loop, of several; a fleet's are agv_01, agv_02, ...")
+@click.option("--config", type=click.Path(path_type=Path), help="The loop's params file; else its nodes are asked.")
+@click.option("--plant-domain", type=click.IntRange(0, 232), help="DDS domain of the AGV, if not the usual one.")
+@click.option("--edge-domain", type=click.IntRange(0, 232), help="DDS domain of the edge, likewise.")
+@click.option("--save-to", type=click.Path(path_type=Path), default=Path("bags"), show_default=True,
+              help="Where bags go that the page saves.")  # fmt: skip
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address of this machine to serve the page on.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8051, show_default=True, help="0: any free one.")
+@click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
+@click.option("--of-run", is_flag=True, hidden=True, help="The page belongs to a run: its button stop says so here.")
+def command(
+    namespace: str, config: Path | None, plant_domain: int | None, edge_domain: int | None, save_to: Path, host: str,
+    port: int, no_browser: bool, of_run: bool,
+) -> None:  # fmt: skip
+    """Watch a running loop in the browser: track, deviation, speed, losses, and what they say of it. Ctrl-C stops it.
+
+    It only listens, with best effort: the loop neither waits for it nor notices it. Sliders and buttons set
+    parameters of the nodes.
+
+    \b
+    Examples:
+      agv-ncs watch
+      agv-ncs watch --namespace agv_03
+      agv-ncs watch --host 192.168.1.20 --port 8051 --no-browser
+    """
+    with needs_ros():
+        from agv_analysis.watch.watcher_node import watch
+    from agv_analysis.watch.beside_run import SERVED, STOP
+
+    def ready(address: str) -> None:
+        click.echo(f"{SERVED}{address}" + ("" if of_run else " (Ctrl-C stops it)"))
+        if not no_browser:
+            import webbrowser
+
+            webbrowser.open(address)
+
+    domains = tuple(-1 if domain is None else domain for domain in (plant_domain, edge_domain))
+    stop = (lambda: click.echo(STOP)) if of_run else None
+    watch(namespace, config, (domains[0], domains[1]), save_to, (host, port), ready, stop)

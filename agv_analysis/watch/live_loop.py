@@ -1,0 +1,221 @@
+"""A running loop as its topics tell it: each message becomes values of its step, and steps become points to draw."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from agv_analysis.metrics.initial_error import TOLERANCE
+from agv_analysis.run import Floats
+from agv_analysis.scenario import Scenario
+from agv_analysis.watch.message_log import Heard
+from agv_analysis.watch.step_ring import StepRing, column
+from agv_cloud.parameters import PATH
+from agv_cloud.reference.reference import Reference
+from agv_ros.codec import decode_command, decode_error, decode_odometry, decode_pose, decode_slot
+from agv_ros.message_types import ODOMETRY, TWIST
+from agv_ros.messages import DELAYED, LOST, InvalidMessageError
+from agv_ros.stamps import to_nanoseconds
+
+TOPICS = ("edge/slot", "agv/pose", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "agv/slot", "/diagnostics")
+"""What is heard; the number of a topic is its place here. Slots come first: they say that a loop has begun anew."""
+
+DIAGNOSTICS = TOPICS.index("/diagnostics")
+
+MINUTES = 10.0
+"""How far back is kept."""
+
+POINT_SECONDS = 0.05
+"""Time of the loop behind one point to draw: 20 a second."""
+
+POINTS = ("time", "x", "y", "deviation", "speed", "age", "lost", "commands_lost")
+"""A point: time since step 0 [s] of its last step, and where the AGV was then [m]; the largest deviation [m], the last
+speed [m/s] and the largest age [s] in it; slots of up- and downlink that were lost in it."""
+
+_MOST_STEPS = 2_000_000
+"""Steps that are kept at most, in 180 MB."""
+
+_DEVIATION = POINTS.index("deviation")
+
+_RECENT = 20
+"""Steps in which the newest value is looked for."""
+
+_BEHIND = 2
+"""Points are made this many points late: by then the messages of their steps are here."""
+
+
+class LiveLoop:
+    """What was seen of one loop since it began, or since it was first heard."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        plant, detector = scenario.plant, scenario.error_detector
+        self.scenario = scenario
+        self.ts = plant.ts
+        self.steps_per_point = max(1, round(POINT_SECONDS / plant.ts))
+        self.most_points = round(60.0 * MINUTES / (self.steps_per_point * plant.ts))
+        self._ts_ns, self._start_ns = to_nanoseconds(plant.ts), to_nanoseconds(plant.start_time)
+        self._on_grid = scenario.relay.stamps == "grid"
+        self._reference = None if detector.track == PATH else Reference(detector)
+        decode = decode_odometry if scenario.relay.pose_type == ODOMETRY else decode_pose
+        command = TOPICS.index("edge/cmd_vel" if scenario.relay.command_type == TWIST else "agv/cmd_vel")
+        self._on: dict[int, Callable[[bytes], None]] = {
+            TOPICS.index("edge/slot"): self._on_slot,
+            TOPICS.index("agv/pose"): lambda data: self._on_pose(*decode(data)),
+            TOPICS.index("edge/error"): self._on_error,
+            command: self._on_command,
+            TOPICS.index("agv/slot"): self._on_command_slot,
+        }
+        self.restarts = 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self.ring = StepRing(min(_MOST_STEPS, math.ceil(60.0 * MINUTES / self.ts)))
+        self.rejected: Counter[str] = Counter()
+        self.first = -1
+        """The first slot that was seen."""
+        self.slots = self.lost = self.command_slots = self.commands_lost = 0
+        self.delayed = 0
+        self.outage = self.longest_outage = 0
+        """Length of the outage that goes on, and of the longest one [slots]."""
+        self.skipped = 0
+        """Slots that were not seen, between others that were."""
+        self.points: list[list[float]] = []
+        self.settled = -1
+        """Number of the first point at which the AGV was less than 1 cm from its reference; -1: there is none."""
+        self.points_before = 0
+        """Points that are kept no longer."""
+        self._last_slot = -1
+        self._next_point = -1
+        self._origin_ns = self._start_ns if self._on_grid else -1
+
+    @property
+    def k(self) -> int:
+        """The newest step of which a slot was seen; -1: none."""
+        return self._last_slot
+
+    def take(self, messages: Iterable[Heard]) -> None:
+        """Take in messages in the order of their topics and, of one topic, of time."""
+        for topic, data, _ in messages:
+            act = self._on.get(topic)
+            if act is not None:
+                try:
+                    act(data)
+                except InvalidMessageError:
+                    self.rejected[TOPICS[topic]] += 1
+
+    def _step(self, stamp_ns: int) -> int:
+        """The step of a stamp; of a robot with a clock of its own the nearest one since the first."""
+        if self._origin_ns < 0:
+            self._origin_ns = stamp_ns
+        k = (stamp_ns - self._origin_ns + self._ts_ns // 2) // self._ts_ns
+        if k < 0:
+            raise InvalidMessageError(f"stamp {stamp_ns} is before the first step")
+        return k
+
+    def _on_pose(self, stamp_ns: int, x: float, y: float, theta: float) -> None:
+        self.ring.put(self._step(stamp_ns), "x", x, y, theta)
+
+    def _on_slot(self, data: bytes) -> None:
+        slot = decode_slot(data)
+        k, lost = self._step(slot.stamp_ns), slot.outcome == LOST
+        if k == 0 and self._last_slot > 0:  # the loop has begun anew
+            self.restarts += 1
+            self._clear()
+        if k <= self._last_slot:
+            return
+        age = (slot.stamp_ns - slot.freshest_ns) // self._ts_ns if slot.freshest_ns else math.nan
+        self.ring.put(k, "age", float(age), float(lost))
+        if self.first < 0:
+            self.first, self._last_slot = k, k - 1
+            self._next_point = -(-k // self.steps_per_point)
+        self.skipped += k - self._last_slot - 1
+        self._last_slot = k
+        self.slots += 1
+        self.lost += lost
+        self.delayed += slot.outcome == DELAYED
+        self.outage = self.outage + 1 if lost else 0
+        self.longest_outage = max(self.longest_outage, self.outage)
+
+    def _on_error(self, data: bytes) -> None:
+        error = decode_error(data)
+        self.ring.put(self._step(error.stamp_ns), "x_e", error.x_e, error.y_e, error.theta_e)
+
+    def _on_command(self, data: bytes) -> None:
+        command = decode_command(data)
+        self.ring.put(self._step(command.stamp_ns), "v", command.v, command.w)
+
+    def _on_command_slot(self, data: bytes) -> None:
+        slot = decode_slot(data)
+        lost = slot.outcome == LOST
+        self.ring.put(self._step(slot.stamp_ns), "command_lost", float(lost))
+        self.command_slots += 1
+        self.commands_lost += lost
+        self.delayed += slot.outcome == DELAYED
+
+    # -- what is drawn and said ----------------------------------------------------------------------------------------
+
+    def deviations(self, begin: int, end: int) -> Floats:
+        """Distance of the AGV's poses from the reference [m] at the steps begin .. end - 1, shape (end - begin,).
+
+        On a planner's path, which is not known here, the tracking error where the edge had a fresh pose; NaN elsewhere.
+        """
+        rows = self.ring.rows(begin, end)
+        if self._reference is None:
+            size = np.hypot(column(rows, "x_e"), column(rows, "y_e"))
+            return np.where(column(rows, "age") == 0.0, size, math.nan)
+        points = np.array([self._reference[k][:2] for k in range(begin, end)]).reshape(-1, 2)
+        found: Floats = np.hypot(column(rows, "x") - points[:, 0], column(rows, "y") - points[:, 1])
+        return found
+
+    def make_points(self, is_over: bool = False) -> None:
+        """Append the points whose steps are complete; of a loop that is over all but a part of one."""
+        behind = 0 if is_over else _BEHIND
+        while self._next_point >= 0 and (self._next_point + 1 + behind) * self.steps_per_point <= self._last_slot + 1:
+            begin = self._next_point * self.steps_per_point
+            self.points.append(self._point(begin, begin + self.steps_per_point))
+            if self.settled < 0 and self.points[-1][_DEVIATION] < TOLERANCE:
+                self.settled = self.points_before + len(self.points) - 1
+            self._next_point += 1
+        surplus = len(self.points) - self.most_points
+        if surplus > 0:
+            del self.points[:surplus]
+            self.points_before += surplus
+
+    def _point(self, begin: int, end: int) -> list[float]:
+        rows = self.ring.rows(begin, end)
+        x, y, v = (_last(column(rows, name)) for name in ("x", "y", "v"))
+        age = _largest(column(rows, "age")) * self.ts
+        lost, commands = (float(np.nansum(column(rows, name))) for name in ("lost", "command_lost"))
+        return [(end - 1) * self.ts, x, y, _largest(self.deviations(begin, end)), v, age, lost, commands]
+
+    def latest(self, name: str) -> float:
+        """The newest value that is known of a column; NaN if there is none in the last steps."""
+        return _last(column(self.ring.rows(max(0, self.k - _RECENT), self.k + 1), name))
+
+    def latest_deviation(self) -> tuple[int, float]:
+        """The newest step whose deviation is known, and it [m]; -1 and NaN if there is none in the last steps."""
+        begin = max(0, self.k - _RECENT)
+        found = self.deviations(begin, self.k + 1)
+        known = np.flatnonzero(~np.isnan(found))
+        return (begin + int(known[-1]), float(found[known[-1]])) if len(known) else (-1, math.nan)
+
+    def not_covered(self) -> str:
+        """Why the links are none of which the margin knows; empty if they are."""
+        if self.commands_lost:
+            return "commands are lost as well: save the bag, and agv-ncs analyse judges both links"
+        if self.delayed:
+            return "messages come late: save the bag, and agv-ncs analyse judges it"
+        return ""
+
+
+def _last(values: Floats) -> float:
+    known = values[~np.isnan(values)]
+    return float(known[-1]) if len(known) else math.nan
+
+
+def _largest(values: Floats) -> float:
+    known = values[~np.isnan(values)]
+    return float(known.max()) if len(known) else math.nan

@@ -1,0 +1,143 @@
+"""The row of figures at the head of the page: is it safe, how far, how sure."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from agv_analysis.corridor.widths import widths_of
+from agv_analysis.metrics.initial_error import TOLERANCE
+from agv_analysis.watch.link_margin import STABLE, UNSTABLE, LinkMargin
+from agv_analysis.watch.live_loop import POINTS, LiveLoop
+
+LOOK_BACK = 60.0
+"""Time [s] of the loop over which the largest deviation is said."""
+
+GOOD, FAIR, BAD = "good", "fair", "bad"
+
+
+class LiveTile(NamedTuple):
+    """One figure: what it is, its value, what goes with it, and whether that is good, fair or bad; empty: neither."""
+
+    key: str
+    label: str
+    value: str
+    note: str
+    mood: str = ""
+
+
+def live_tiles(loop: LiveLoop, margin: LinkMargin | None, deadlines: dict[str, str]) -> list[LiveTile]:
+    """The figures of a loop now."""
+    largest = recent_deviation(loop)
+    return [
+        _verdict(margin), _deviation(loop, largest), _corridor(loop, largest), _losses(loop), _outage(loop, margin),
+        _age(loop), _speed(loop), _deadlines(loop, deadlines),
+    ]  # fmt: skip
+
+
+def recent_deviation(loop: LiveLoop) -> float:
+    """The largest deviation [m] of the points of the last LOOK_BACK seconds; NaN if none is known.
+
+    Only of points after one at which it was below 1 cm, as a report takes it: before, it is the initial error.
+    """
+    if loop.settled < 0:
+        return math.nan
+    count = max(1, round(LOOK_BACK / (loop.steps_per_point * loop.ts)))
+    place, begin = POINTS.index("deviation"), max(len(loop.points) - count, loop.settled - loop.points_before, 0)
+    known = [point[place] for point in loop.points[begin:] if not math.isnan(point[place])]
+    return max(known, default=math.nan)
+
+
+def _verdict(margin: LinkMargin | None) -> LiveTile:
+    label = "Loop on this link"
+    if margin is None:
+        return LiveTile("word", label, "…", "computing")
+    if margin.probability_stable is None:
+        return LiveTile("word", label, margin.word, margin.reason, BAD if margin.word == UNSTABLE else FAIR)
+    mood = {STABLE: GOOD, UNSTABLE: BAD}.get(margin.word, FAIR)
+    sure = f"stable in mean square with a probability of {_percent(margin.probability_stable)}"
+    return LiveTile("word", label, margin.word, f"{sure}, from {margin.slots} slots", mood)
+
+
+def _percent(share: float) -> str:
+    """A probability, never rounded to certainty."""
+    if 0.999 < share < 1.0:
+        return "more than 99.9 %"
+    return "less than 0.1 %" if 0.0 < share < 0.001 else f"{100.0 * share:.3g} %"
+
+
+def _deviation(loop: LiveLoop, largest: float) -> LiveTile:
+    _, now = loop.latest_deviation()
+    settled = f"at most {metres(largest)} in the last {_seconds(loop)}"
+    note = settled if not math.isnan(largest) else f"the initial error has not been below {metres(TOLERANCE)} yet"
+    return LiveTile("deviation", "Deviation now", metres(now), note)
+
+
+def _seconds(loop: LiveLoop) -> str:
+    points = len(loop.points) - max(0, loop.settled - loop.points_before)
+    seen = points * loop.steps_per_point * loop.ts
+    return f"{min(LOOK_BACK, max(seen, loop.ts)):.3g} s"
+
+
+def metres(value: float) -> str:
+    """A distance with a unit, to the millimetre."""
+    return "not known" if math.isnan(value) else f"{value:.3f} m"
+
+
+def _corridor(loop: LiveLoop, largest: float) -> LiveTile:
+    widths = widths_of(loop.scenario.error_detector)
+    if widths is None:
+        return LiveTile("corridor", "Corridor", "none given", "error_detector.corridor")
+    width = f"{widths.half_width:g} m"
+    if math.isinf(widths.distance):
+        return LiveTile("corridor", "Corridor", width, f"{widths.along:g} m along the track; not judged here")
+    if math.isnan(largest):
+        return LiveTile("corridor", "Corridor", width, "not judged before the initial error has settled")
+    share = largest / widths.distance
+    said = f"of it used at most, in the last {_seconds(loop)}"
+    if share > 1.0:
+        return LiveTile("corridor", "Corridor", f"{width}: left", f"{100.0 * share:.0f} % {said}", BAD)
+    return LiveTile("corridor", "Corridor", f"{width}: kept", f"{100.0 * share:.0f} % {said}", GOOD)
+
+
+def _losses(loop: LiveLoop) -> LiveTile:
+    if not loop.slots:
+        return LiveTile("losses", "Lost updates", "none seen", "")
+    skipped = f"; {loop.skipped} slots not seen by this page" if loop.skipped else ""
+    commands = f"; {loop.commands_lost} of {loop.command_slots} commands" if loop.commands_lost else ""
+    note = f"{loop.lost} of {loop.slots} since {loop.first * loop.ts:g} s{commands}{skipped}"
+    return LiveTile("losses", "Lost updates", f"{100.0 * loop.lost / loop.slots:.2f} %", note)
+
+
+def _outage(loop: LiveLoop, margin: LinkMargin | None) -> LiveTile:
+    longest = loop.longest_outage
+    value, mood = f"{longest} slots ({longest * loop.ts * 1e3:g} ms)", ""
+    note = "guaranteed limit: not known"
+    if margin is not None and margin.guaranteed is not None and margin.guaranteed >= 0:
+        mood = GOOD if longest <= margin.guaranteed else FAIR
+        note = f"guaranteed limit: {margin.guaranteed} slots ({margin.guaranteed * loop.ts * 1e3:g} ms)"
+    return LiveTile("outage", "Longest outage", value, note, mood)
+
+
+def _age(loop: LiveLoop) -> LiveTile:
+    age = loop.latest("age")
+    if math.isnan(age):
+        return LiveTile("age", "Age of information", "not known", "")
+    return LiveTile("age", "Age of information", f"{age * loop.ts * 1e3:.0f} ms", f"{age:.0f} steps of {loop.ts:g} s")
+
+
+def _speed(loop: LiveLoop) -> LiveTile:
+    v, w = loop.latest("v"), loop.latest("w")
+    if math.isnan(v):
+        return LiveTile("speed", "Speed", "not known", "")
+    return LiveTile("speed", "Speed", f"{v:.2f} m/s", f"turning at {w:.2f} rad/s")
+
+
+def _deadlines(loop: LiveLoop, deadlines: dict[str, str]) -> LiveTile:
+    missed, step = deadlines.get("missed deadlines"), deadlines.get("step", "0")
+    if missed is not None:
+        note = f"in {step} steps; jitter p99 {float(deadlines.get('jitter p99 [s]', 'nan')) * 1e3:.2g} ms"
+        return LiveTile("deadlines", "Missed deadlines", missed, note, "" if missed == "0" else FAIR)
+    if loop.scenario.plant.clock == "lockstep":
+        return LiveTile("deadlines", "Missed deadlines", "none", "lockstep has no deadlines")
+    return LiveTile("deadlines", "Missed deadlines", "not known", "no report of the plant yet")

@@ -1,0 +1,49 @@
+"""What was heard of a loop as a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import yaml
+
+from agv_analysis.bags.message_definitions import schema_of
+from agv_analysis.bags.rosbag2_metadata import TopicInfo
+from agv_analysis.bags.writer import NODES_NAME, BagWriter
+from agv_analysis.scenario import Scenario
+from agv_analysis.version import version
+from agv_analysis.watch.message_log import MessageLog
+from agv_ros.codec import stamp_of
+from agv_ros.ros_yaml import dump
+
+
+def save_bag(
+    directory: Path, log: MessageLog, names: Sequence[str], types: Sequence[str], scenario: Scenario,
+    nodes: Mapping[str, str],
+) -> int:  # fmt: skip
+    """Write the messages of a log to a new directory; returns how many.
+
+    `names` and `types` are those of the topics by number, `scenario` what the loop began with, `nodes` the full names
+    of its nodes. Raises UserError if the directory exists or cannot be made, OSError if it cannot be written to.
+    """
+    known = [TopicInfo(name, kind, schema_of(kind), "", []) for name, kind in zip(names, types, strict=True)]
+    params = scenario.to_yaml()
+    about = {"version": version(), "seed": str(scenario.relay.seed), "params": params}
+    by_stamp = scenario.plant.clock == "lockstep"
+    writer = BagWriter(directory, [partial(known.__getitem__, i) for i in range(len(known))], about, by_stamp)
+    try:
+        for topic, data, received_ns in log.messages():
+            stamp_ns = max(0, stamp_of(data))
+            writer.write(topic, data, stamp_ns if by_stamp else received_ns, stamp_ns)
+        writer.add_metadata(NODES_NAME, {"params": dump(_sections(scenario)), **nodes})
+        writer.close()
+    except OSError:
+        writer.abandon()
+        raise
+    return sum(writer.counts)
+
+
+def _sections(scenario: Scenario) -> dict[str, dict[str, dict[str, object]]]:
+    found: dict[str, dict[str, dict[str, object]]] = yaml.safe_load(scenario.to_yaml())
+    return found

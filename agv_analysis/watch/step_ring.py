@@ -1,0 +1,56 @@
+"""The last minutes of a loop by step, in arrays of a fixed size."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.run import Floats
+
+COLUMNS = ("x", "y", "theta", "x_e", "y_e", "theta_e", "v", "w", "age", "lost", "command_lost")
+"""Pose [m, m, rad], tracking error [m, m, rad], the command that acts [m/s, rad/s], age of the edge's pose [steps], and
+whether the pose and the command of the step were lost (0 or 1). NaN: not seen."""
+
+_PLACE = {name: i for i, name in enumerate(COLUMNS)}
+
+
+class StepRing:
+    """What was seen of each of the last `capacity` steps; of an earlier step nothing is known any more."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._steps = np.full(capacity, -1, dtype=np.int64)
+        self._values = np.full((capacity, len(COLUMNS)), math.nan)
+
+    def put(self, k: int, first: str, *values: float) -> None:
+        """Keep values of step k >= 0, in the columns from `first` on."""
+        row = k % self._capacity
+        if self._steps[row] != k:
+            if k < self._steps[row]:
+                return
+            self._steps[row] = k
+            self._values[row] = math.nan
+        place = _PLACE[first]
+        self._values[row, place : place + len(values)] = values
+
+    def rows(self, begin: int, end: int) -> Floats:
+        """What is known of the steps begin .. end - 1, shape (end - begin, columns)."""
+        k = np.arange(begin, end, dtype=np.int64)
+        found = self._values[k % self._capacity]
+        found[self._steps[k % self._capacity] != k] = math.nan
+        return found
+
+    def seen(self, column: str, end: int) -> tuple[NDArray[np.int64], Floats]:
+        """The steps before `end` of which a column is known, increasing, and its values, both of shape (N,)."""
+        begin = max(0, end - self._capacity)
+        values = self.rows(begin, end)[:, _PLACE[column]]
+        known = ~np.isnan(values)
+        return np.flatnonzero(known) + begin, values[known]
+
+
+def column(rows: Floats, name: str) -> Floats:
+    """A column of the rows of a StepRing, shape (N,)."""
+    found: Floats = rows[:, _PLACE[name]]
+    return found

@@ -1,0 +1,177 @@
+"""The node that listens to a running loop, and takes no part in it.
+
+Its subscriptions ask for best effort: publishers neither wait for it nor send again what it has missed, so a page that
+lags costs the loop nothing. It has no executor: what has come is taken in one go, some times a second, which costs a
+fraction of a callback for each message.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import TimeReference
+
+from agv_analysis.scenario import load_scenario
+from agv_analysis.watch.live_loop import DIAGNOSTICS, TOPICS
+from agv_analysis.watch.message_log import Heard
+from agv_analysis.watch.remote_parameters_node import RemoteParameters
+from agv_analysis.watch.watch_page import served
+from agv_analysis.watch.watch_session import TICK, WatchSession
+from agv_ros.endpoints import WATCHER
+from agv_ros.errors import UserError
+from agv_ros.executor import stop_on_signals
+from agv_ros.node import ENDED
+
+_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+_KINDS: dict[str, tuple[type, ...]] = {
+    "edge/slot": (TimeReference,), "agv/pose": (PoseStamped, Odometry), "edge/error": (Odometry,),
+    "edge/cmd_vel": (TwistStamped,), "agv/cmd_vel": (TwistStamped, Twist), "agv/slot": (TimeReference,),
+    "/diagnostics": (DiagnosticArray,),
+}  # fmt: skip
+"""Types that a topic may have; the first is listened to until another one is offered."""
+
+
+_LOOK = 20
+"""Ticks between two looks at the types that the loop's topics have."""
+
+EVERYWHERE = ("", "0.0.0.0", "::")
+
+
+class WatcherNode:
+    """Listens to the loop of a namespace, on both sides of the radio."""
+
+    def __init__(self, namespace: str = "", plant_domain_id: int = -1, edge_domain_id: int = -1) -> None:
+        self.namespace = namespace.strip("/")
+        self._contexts: dict[int, Context] = {}
+        self._nodes: dict[int, Node] = {}
+        self.agv, self.edge = self.in_domain(plant_domain_id), self.in_domain(edge_domain_id)
+        self._topics = [(number, topic, self._side_of(topic)) for number, topic in enumerate(TOPICS)]
+        if self.edge is not self.agv:
+            self._topics.append((DIAGNOSTICS, "/diagnostics", self.edge))
+        if self.namespace:  # a fleet's vehicles have a topic of their own
+            self._topics.append((DIAGNOSTICS, "diagnostics", self.agv))
+        kinds = [_KINDS["/diagnostics" if number == DIAGNOSTICS else topic][0] for number, topic, _ in self._topics]
+        self._heard: list[Subscription] = [
+            self._listen(node, kind, topic) for kind, (_, topic, node) in zip(kinds, self._topics, strict=True)
+        ]
+
+    def in_domain(self, domain_id: int) -> Node:
+        """The participant in a DDS domain; a negative id: the usual one."""
+        context = Context()
+        rclpy.init(
+            context=context, domain_id=None if domain_id < 0 else domain_id,
+            signal_handler_options=SignalHandlerOptions.NO,
+        )  # fmt: skip
+        number = context.get_domain_id()
+        if number in self._nodes:
+            context.try_shutdown()
+            return self._nodes[number]
+        self._contexts[number] = context
+        self._nodes[number] = Node(
+            WATCHER, context=context, namespace=self.namespace or None, use_global_arguments=False,
+            enable_rosout=False, start_parameter_services=False,
+        )  # fmt: skip
+        return self._nodes[number]
+
+    def _side_of(self, topic: str) -> Node:
+        return self.edge if topic.startswith("edge/") else self.agv
+
+    def _listen(self, node: Node, kind: type, topic: str) -> Subscription:
+        return node.create_subscription(kind, topic, lambda _: None, _QOS, raw=True)
+
+    def look(self) -> None:
+        """Listen to another type where the loop offers one, as the odometry of a robot. To be called now and then."""
+        for i, (_, topic, node) in enumerate(self._topics):
+            for kind in _KINDS.get(topic, ()):
+                name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+                infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+                if kind is not self._heard[i].msg_type and any(info.topic_type == name for info in infos):
+                    node.destroy_subscription(self._heard[i])
+                    self._heard[i] = self._listen(node, kind, topic)
+                    break
+
+    def names(self) -> list[str]:
+        """Full names of the topics, in the order of TOPICS."""
+        return [self._side_of(topic).resolve_topic_name(topic) for topic in TOPICS]
+
+    def types(self) -> list[str]:
+        """Names of their types, as in sensor_msgs/msg/TimeReference."""
+        kinds = [heard.msg_type for heard in self._heard[: len(TOPICS)]]
+        return [f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}" for kind in kinds]
+
+    def drain(self) -> list[Heard]:
+        """What has come since the last call, topic by topic."""
+        return list(self._taken())
+
+    def _taken(self) -> Iterator[Heard]:
+        for (number, _, _), heard in zip(self._topics, self._heard, strict=True):
+            with heard.handle:
+                while (message := heard.handle.take_message(heard.msg_type, True)) is not None:
+                    data, about = message
+                    yield Heard(number, data, int(about["received_timestamp"]))
+
+    def reports_in(self, data: bytes) -> Iterator[tuple[str, dict[str, str], bool]]:
+        """What each node of this loop says in a message of diagnostics: its name, its facts, and has it ended?"""
+        for status in deserialize_message(data, DiagnosticArray).status:
+            namespace, _, name = status.name.strip("/").rpartition("/")
+            if namespace == self.namespace:
+                facts = {value.key: value.value for value in status.values}
+                yield name, facts, ENDED in facts
+
+    def close(self) -> None:
+        """Leave all domains."""
+        for node in self._nodes.values():
+            node.destroy_node()
+        for context in self._contexts.values():
+            context.try_shutdown()
+
+
+def watch(
+    namespace: str, config: Path | None, domains: tuple[int, int], folder: Path, where: tuple[str, int],
+    ready: Callable[[str], None], stop_run: Callable[[], None] | None,
+) -> None:  # fmt: skip
+    """Serve the page of a namespace's loop at host and port `where`; `ready` is told its address.
+
+    `domains` are the DDS domains of AGV and edge, negative: the usual one. `stop_run` ends the run that the page
+    belongs to. Raises UserError if the params file, host or port cannot be used.
+    """
+    if where[0] in EVERYWHERE:
+        raise UserError(f"--host {where[0]!r} names no address: name the one by which others reach this machine")
+    scenario = None if config is None else load_scenario(str(config))
+    with stop_on_signals() as stop:
+        watcher = WatcherNode(namespace, *domains)
+        remote = RemoteParameters(watcher.agv, watcher.edge)
+        session = WatchSession(watcher, remote, scenario, folder, stop_run)
+        try:
+            with served(session, *where) as address:
+                ready(address)
+                _listen(session, lambda: stop.requested)
+                session.end()
+        finally:
+            session.close()
+            remote.close()
+            watcher.close()
+
+
+def _listen(session: WatchSession, is_done: Callable[[], bool]) -> None:
+    count, due = 0, time.monotonic()
+    while not is_done():
+        if count % _LOOK == 0:
+            session.watcher.look()
+        session.tick()
+        count, due = count + 1, max(due + TICK, time.monotonic())
+        time.sleep(max(0.0, due - time.monotonic()))
+    session.tick()
