@@ -62,6 +62,10 @@ class Output:
     def _is_heard_by_a_peer(self) -> bool:
         return any(name not in (*_RECORDERS, WATCHER) for name in self._names_of_subscribers())
 
+    def is_watched(self) -> bool:
+        """Does a watcher listen?"""
+        return WATCHER in self._names_of_subscribers()
+
     def _names_of_subscribers(self) -> list[str]:
         infos = self._where.get_subscriptions_info_by_topic(self.topic)
         # A name that begins with _ is one that is not known yet.

@@ -101,8 +101,11 @@ def command(
         _watched(scenario, host, port) if live else nullcontext(),
         step_bar(scenario.plant.duration / scenario.plant.ts) as progress,
     ):
-        run = run_in_processes if processes else run_in_process
-        outcome = run(scenario, bag, progress, on_disk=OnDisk(fsync, if_unwritable))
+        disk = OnDisk(fsync, if_unwritable)
+        if processes:
+            outcome = run_in_processes(scenario, bag, progress, on_disk=disk)
+        else:
+            outcome = run_in_process(scenario, bag, progress, on_disk=disk, is_watched=live)
     click.echo(f"{outcome.steps} steps" + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
     if outcome.recording:
         click.echo(f"bag: {bag}: {outcome.recording}")

@@ -20,6 +20,7 @@ from agv_analysis.runtime.replay_node import Pace, ReplayNode, ReplayRecorder
 from agv_analysis.runtime.run_setup import AS_USUAL, PATIENCE, OnDisk, params_file, recording_of, scenario_that_waits
 from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario
+from agv_analysis.watch.live_loop import TOPICS
 from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
@@ -39,20 +40,36 @@ NODES: dict[str, Callable[..., LoopNode[Any]]] = {
 _EVENTS_PER_LOOK = 256
 """How many events pass between two calls of `progress`."""
 
+_WATCHED = {topic.strip("/") for topic in TOPICS}
+
+_PATIENCE_WITH_WATCHER, _LOOK_PERIOD = 5.0, 0.01
+"""How long a run waits for its watcher, and how often it looks [s]."""
+
 Progress = Callable[[int], None]
 """Called with the number of steps done, every now and then."""
 
 
 def run_in_process(
-    scenario: Scenario, bag: Path | None, progress: Progress, executor: str = "events", on_disk: OnDisk = AS_USUAL
-) -> Outcome:
+    scenario: Scenario, bag: Path | None, progress: Progress, executor: str = "events", on_disk: OnDisk = AS_USUAL,
+    is_watched: bool = False,
+) -> Outcome:  # fmt: skip
     """Run a scenario with all nodes in this process.
 
+    One that `is_watched` begins once the watcher listens to all that it publishes, or some seconds later without it.
     Raises UserError if a parameter, the track's file or the bag's path cannot be used.
     """
     with stop_on_signals() as stop, OneProcess() as process:
         loop = loop_of(process, scenario, bag, on_disk=on_disk)
+        if is_watched:
+            _wait_for_watcher(loop)
         return run_loops(EXECUTORS[executor](context=process.context), [loop], stop, progress)[0]
+
+
+def _wait_for_watcher(loop: Loop) -> None:
+    watched = [output for node in loop.nodes for output in node.outputs if output.topic.strip("/") in _WATCHED]
+    deadline = time.monotonic() + _PATIENCE_WITH_WATCHER
+    while not all(output.is_watched() for output in watched) and time.monotonic() < deadline:
+        time.sleep(_LOOK_PERIOD)
 
 
 def run_fleet(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from agv_analysis.metrics.initial_error import TOLERANCE
+from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.watch.message_log import Heard

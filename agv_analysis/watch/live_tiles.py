@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 from agv_analysis.corridor.widths import widths_of
-from agv_analysis.metrics.initial_error import TOLERANCE
+from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.watch.link_margin import STABLE, UNSTABLE, LinkMargin
 from agv_analysis.watch.live_loop import POINTS, LiveLoop
 

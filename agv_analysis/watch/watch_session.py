@@ -211,9 +211,9 @@ class WatchSession:
         content["tiles"] = live_tiles(loop, self.margin, self._deadlines)
         k, deviation = loop.latest_deviation()
         content["now"] = {
-            "k": loop.k, "first": loop.first, "slots": loop.slots, "lost": loop.lost, "longest": loop.longest_outage,
-            "deviation_k": k, "deviation": None if math.isnan(deviation) else deviation,
-            "x": _rounded(loop.latest("x")), "y": _rounded(loop.latest("y")), "theta": _rounded(loop.latest("theta")),
+            "k": loop.k, "first": loop.first, "slots": loop.slots, "skipped": loop.skipped, "lost": loop.lost,
+            "longest": loop.longest_outage, "deviation_k": k, "deviation": None if math.isnan(deviation) else deviation,
+            "x": _rounded(loop.latest("x")), "y": _rounded(loop.latest("y")),
         }  # fmt: skip
         return json.dumps(content), loop.points_before + len(loop.points), self._edition
 
@@ -247,7 +247,7 @@ class WatchSession:
         node, _, name = target.partition(".")
         self._remote.set(node, name, math.inf if value is None else value)
         self._is_stale = True
-        return f"{target} = {'no limit' if value is None else value}"
+        return f"{target} = {'no limit' if value is None else f'{value:g}'}"
 
     def lose(self, slots: int | None, seconds: float) -> str:
         """Lose the next slots of the uplink, or all for some seconds. Raises ParameterError."""
