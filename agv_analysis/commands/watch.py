@@ -38,6 +38,10 @@ def command(
     with needs_ros():
         from agv_analysis.watch.watcher_node import watch
     from agv_analysis.watch.beside_run import SERVED, STOP
+    from agv_ros.discovery import discovery_note
+
+    if not of_run:
+        click.echo(discovery_note(), err=True)
 
     def ready(address: str) -> None:
         click.echo(f"{SERVED}{address}" + ("" if of_run else " (Ctrl-C stops it)"))

@@ -85,6 +85,8 @@ class LiveLoop:
         self.points: list[list[float]] = []
         self.settled = -1
         """Number of the first point at which the AGV was less than 1 cm from its reference; -1: there is none."""
+        self.settled_at: float | None = None
+        """Its time [s]."""
         self.points_before = 0
         """Points that are kept no longer."""
         self._last_slot = -1
@@ -177,7 +179,7 @@ class LiveLoop:
             begin = self._next_point * self.steps_per_point
             self.points.append(self._point(begin, begin + self.steps_per_point))
             if self.settled < 0 and self.points[-1][_DEVIATION] < TOLERANCE:
-                self.settled = self.points_before + len(self.points) - 1
+                self.settled, self.settled_at = self.points_before + len(self.points) - 1, self.points[-1][0]
             self._next_point += 1
         surplus = len(self.points) - self.most_points
         if surplus > 0:

@@ -55,21 +55,21 @@ def _verdict(margin: LinkMargin | None) -> LiveTile:
     if margin.probability_stable is None:
         return LiveTile("word", label, margin.word, margin.reason, BAD if margin.word == UNSTABLE else FAIR)
     mood = {STABLE: GOOD, UNSTABLE: BAD}.get(margin.word, FAIR)
-    sure = f"stable in mean square with a probability of {_percent(margin.probability_stable)}"
-    return LiveTile("word", label, margin.word, f"{sure}, from {margin.slots} slots", mood)
+    sure = f"in mean square, {_percent(margin.probability_stable)} probable ({margin.slots} slots)"
+    return LiveTile("word", label, margin.word, sure if margin.word == STABLE else f"stable {sure}", mood)
 
 
 def _percent(share: float) -> str:
     """A probability, never rounded to certainty."""
     if 0.999 < share < 1.0:
-        return "more than 99.9 %"
-    return "less than 0.1 %" if 0.0 < share < 0.001 else f"{100.0 * share:.3g} %"
+        return "> 99.9 %"
+    return "< 0.1 %" if 0.0 < share < 0.001 else f"{100.0 * share:.3g} %"
 
 
 def _deviation(loop: LiveLoop, largest: float) -> LiveTile:
     _, now = loop.latest_deviation()
     settled = f"at most {metres(largest)} in the last {_seconds(loop)}"
-    note = settled if not math.isnan(largest) else f"the initial error has not been below {metres(TOLERANCE)} yet"
+    note = settled if not math.isnan(largest) else f"not below {metres(TOLERANCE)} since it began"
     return LiveTile("deviation", "Deviation now", metres(now), note)
 
 
@@ -92,9 +92,9 @@ def _corridor(loop: LiveLoop, largest: float) -> LiveTile:
     if math.isinf(widths.distance):
         return LiveTile("corridor", "Corridor", width, f"{widths.along:g} m along the track; not judged here")
     if math.isnan(largest):
-        return LiveTile("corridor", "Corridor", width, "not judged before the initial error has settled")
+        return LiveTile("corridor", "Corridor", width, "not judged: initial error")
     share = largest / widths.distance
-    said = f"of it used at most, in the last {_seconds(loop)}"
+    said = f"of it used in the last {_seconds(loop)}"
     if share > 1.0:
         return LiveTile("corridor", "Corridor", f"{width}: left", f"{100.0 * share:.0f} % {said}", BAD)
     return LiveTile("corridor", "Corridor", f"{width}: kept", f"{100.0 * share:.0f} % {said}", GOOD)
@@ -115,7 +115,7 @@ def _outage(loop: LiveLoop, margin: LinkMargin | None) -> LiveTile:
     note = "guaranteed limit: not known"
     if margin is not None and margin.guaranteed is not None and margin.guaranteed >= 0:
         mood = GOOD if longest <= margin.guaranteed else FAIR
-        note = f"guaranteed limit: {margin.guaranteed} slots ({margin.guaranteed * loop.ts * 1e3:g} ms)"
+        note = f"guaranteed limit: {margin.guaranteed} slots"
     return LiveTile("outage", "Longest outage", value, note, mood)
 
 
@@ -136,7 +136,7 @@ def _speed(loop: LiveLoop) -> LiveTile:
 def _deadlines(loop: LiveLoop, deadlines: dict[str, str]) -> LiveTile:
     missed, step = deadlines.get("missed deadlines"), deadlines.get("step", "0")
     if missed is not None:
-        note = f"in {step} steps; jitter p99 {float(deadlines.get('jitter p99 [s]', 'nan')) * 1e3:.2g} ms"
+        note = f"of {step}; jitter p99 {float(deadlines.get('jitter p99 [s]', 'nan')) * 1e3:.2g} ms"
         return LiveTile("deadlines", "Missed deadlines", missed, note, "" if missed == "0" else FAIR)
     if loop.scenario.plant.clock == "lockstep":
         return LiveTile("deadlines", "Missed deadlines", "none", "lockstep has no deadlines")

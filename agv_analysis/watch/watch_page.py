@@ -91,7 +91,7 @@ def _number(value: Any) -> float | None:
 
 def _frames(session: WatchSession) -> Iterator[str]:
     """Frames until the session or the connection ends; the last one is of the session's end."""
-    since, edition, seen, is_last = 0, -1, -1, False
+    since, edition, seen, is_last = 0, (-1, -1), -1, False
     try:
         while not is_last:
             with session.changed:

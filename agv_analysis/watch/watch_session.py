@@ -63,8 +63,8 @@ class WatchSession:
         self.viewers = 0
         self.margin: LinkMargin | None = None
         self._begun_with: Scenario | None = None
-        self._scenario = scenario
-        self._edition = 0
+        self._runs = self._edition = 0
+        """How often the loop has begun anew, and its parameters have been others."""
         self._deadlines: dict[str, str] = {}
         self._changes: dict[tuple[str, str], str] = {}
         self._is_stale = scenario is None
@@ -128,7 +128,8 @@ class WatchSession:
     def _begin_anew(self) -> None:
         self.log.clear()
         self._is_over, self.margin, self._deadlines, self._is_stale = False, None, {}, True
-        self._edition += 1
+        self._begun_with = None
+        self._runs += 1
 
     def _note(self, name: str, facts: dict[str, str], has_ended: bool) -> None:
         if name == "plant":
@@ -159,13 +160,16 @@ class WatchSession:
     _refusal = ""
 
     def _adopt(self, scenario: Scenario) -> None:
+        """Take parameters as those of the loop; where its steps or its track are others now, hear all again."""
         with self.changed:
-            if self.loop is None or self.loop.ts != scenario.plant.ts:
+            if self.loop is None or _heard_by(self.loop.scenario) != _heard_by(scenario):
                 self.loop = LiveLoop(scenario)
-                self.loop.take(self.log.messages())
-                self._begun_with = scenario
-            self.loop.scenario = self._scenario = scenario
-            self._edition += 1
+                self.loop.take(sorted(self.log.messages(), key=lambda heard: heard.topic))
+                self._runs += 1
+            self._begun_with = self._begun_with or scenario
+            if self.loop.scenario != scenario or not self._edition:
+                self.loop.scenario = scenario
+                self._edition += 1
 
     # -- the margin ----------------------------------------------------------------------------------------------------
 
@@ -195,17 +199,20 @@ class WatchSession:
 
     # -- what the page gets --------------------------------------------------------------------------------------------
 
-    def frame(self, since: int, edition: int) -> tuple[str, int, int]:
+    def frame(self, since: int, edition: tuple[int, int]) -> tuple[str, int, tuple[int, int]]:
         """A frame with the points from number `since` on, as JSON, the number of the next one, and the edition.
 
-        Of another edition than the page has, as when the loop began anew or parameters changed, all is told again.
+        If the edition is not that which the page has, the parameters are told as well, and of another run all points.
         """
         loop = self.loop
         content: dict[str, Any] = {"state": self._state()}
         if loop is None:
             return json.dumps(content), 0, edition
-        if edition != self._edition:
-            content["setup"], since = self._setup(loop), 0
+        now = self._runs, self._edition
+        if edition != now:
+            content["setup"] = self._setup(loop)
+            content["anew"] = edition[0] != now[0]
+            since = 0 if content["anew"] else since
         first = max(0, since - loop.points_before)
         content["points"] = [[_rounded(value) for value in point] for point in loop.points[first:]]
         content["tiles"] = live_tiles(loop, self.margin, self._deadlines)
@@ -213,9 +220,9 @@ class WatchSession:
         content["now"] = {
             "k": loop.k, "first": loop.first, "slots": loop.slots, "skipped": loop.skipped, "lost": loop.lost,
             "longest": loop.longest_outage, "deviation_k": k, "deviation": None if math.isnan(deviation) else deviation,
-            "x": _rounded(loop.latest("x")), "y": _rounded(loop.latest("y")),
+            "settled": loop.settled_at, "x": _rounded(loop.latest("x")), "y": _rounded(loop.latest("y")),
         }  # fmt: skip
-        return json.dumps(content), loop.points_before + len(loop.points), self._edition
+        return json.dumps(content), loop.points_before + len(loop.points), now
 
     def _state(self) -> str:
         if self._is_over:
@@ -287,6 +294,13 @@ class WatchSession:
         if self.loop is None:
             raise ParameterError("the parameters of the loop's nodes are not known yet")
         return self.loop
+
+
+def _heard_by(scenario: Scenario) -> tuple[object, ...]:
+    """What decides what the messages of a loop mean."""
+    plant, relay, detector = scenario.plant, scenario.relay, scenario.error_detector
+    track = (detector.track, detector.track_file, detector.track_start, detector.lap_time, detector.speed)
+    return plant.ts, plant.start_time, relay.stamps, relay.pose_type, relay.command_type, *track
 
 
 def _rounded(value: float) -> float | None:
