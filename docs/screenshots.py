@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -22,6 +23,7 @@ SIZES = ((1400, 900), (390, 844))
 SCHEMES = ("light", "dark")
 
 DRAWN = "return document.body.dataset.drawn"
+WATCHED = "return window.now && now.k > 2200 && document.querySelector('#tile-word.good, #tile-word.fair')"
 EXPLORED = "return document.querySelectorAll('#lap tr').length > 3 && document.querySelector('#plot-time .main-svg')"
 
 PAGES = {
@@ -46,6 +48,8 @@ def main() -> None:
             draw(chrome, page.as_uri(), name, DRAWN)
         with explorer("config/outages.yaml", "--corridor", "0.25") as address:
             draw(chrome, address, "explorer", EXPLORED)
+        with watched("config/outages.yaml", "--corridor", "0.25", "--clock", "realtime") as address:
+            draw(chrome, address, "watch", WATCHED)
 
 
 def agv_ncs(*arguments: str) -> list[str]:
@@ -63,6 +67,18 @@ def explorer(*arguments: str) -> Iterator[str]:
             yield served.stdout.readline().split()[1]
         finally:
             served.terminate()
+
+
+@contextmanager
+def watched(*arguments: str) -> Iterator[str]:
+    """Address of the page beside a run that goes on meanwhile."""
+    command = agv_ncs("run", *arguments, "--live", "--port", "0")
+    with subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as run:
+        assert run.stdout is not None
+        try:
+            yield next(line.split()[1] for line in run.stdout if line.startswith("live: "))
+        finally:
+            run.send_signal(signal.SIGINT)
 
 
 @contextmanager

@@ -97,7 +97,7 @@ def test_the_answer_in_metres_of_the_readme_is_true() -> None:
 def test_each_page_is_drawn_at_the_size_of_a_screen_and_of_a_phone_light_and_dark() -> None:
     """`make images` draws them; here they are there, of the size that their names say, and shown by the docs."""
     pages = "".join(page.read_text() for page in (REPOSITORY / "docs").glob("*.md"))
-    for name in ("report", "sweep", "map", "explorer"):
+    for name in ("report", "sweep", "map", "explorer", "watch"):
         for size in ("1400x900", "390x844"):
             for scheme in ("light", "dark"):
                 content = (REPOSITORY / f"docs/images/{name}-{size}-{scheme}.png").read_bytes()

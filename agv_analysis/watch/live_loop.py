@@ -20,8 +20,9 @@ from agv_ros.message_types import ODOMETRY, TWIST
 from agv_ros.messages import DELAYED, LOST, InvalidMessageError
 from agv_ros.stamps import to_nanoseconds
 
-TOPICS = ("edge/slot", "agv/pose", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "agv/slot", "/diagnostics")
-"""What is heard; the number of a topic is its place here. Slots come first: they say that a loop has begun anew."""
+TOPICS = ("edge/slot", "agv/slot", "agv/pose", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "/diagnostics")
+"""What is heard; the number of a topic is its place here. They are taken from in this order: a slot is published after its
+message, so the message of each slot is here by then."""
 
 DIAGNOSTICS = TOPICS.index("/diagnostics")
 
@@ -43,8 +44,8 @@ _DEVIATION = POINTS.index("deviation")
 _RECENT = 20
 """Steps in which the newest value is looked for."""
 
-_BEHIND = 2
-"""Points are made this many points late: by then the messages of their steps are here."""
+_BEHIND, _MOST_BEHIND = 2, 60
+"""Points are made so many points late, when the messages of their steps are here, and at most so many."""
 
 
 class LiveLoop:
@@ -89,7 +90,7 @@ class LiveLoop:
         """Its time [s]."""
         self.points_before = 0
         """Points that are kept no longer."""
-        self._last_slot = -1
+        self._last_slot = self._last_command_slot = -1
         self._next_point = -1
         self._origin_ns = self._start_ns if self._on_grid else -1
 
@@ -152,7 +153,9 @@ class LiveLoop:
     def _on_command_slot(self, data: bytes) -> None:
         slot = decode_slot(data)
         lost = slot.outcome == LOST
-        self.ring.put(self._step(slot.stamp_ns), "command_lost", float(lost))
+        k = self._step(slot.stamp_ns)
+        self.ring.put(k, "command_lost", float(lost))
+        self._last_command_slot = max(k, self._last_command_slot)
         self.command_slots += 1
         self.commands_lost += lost
         self.delayed += slot.outcome == DELAYED
@@ -174,8 +177,7 @@ class LiveLoop:
 
     def make_points(self, is_over: bool = False) -> None:
         """Append the points whose steps are complete; of a loop that is over all but a part of one."""
-        behind = 0 if is_over else _BEHIND
-        while self._next_point >= 0 and (self._next_point + 1 + behind) * self.steps_per_point <= self._last_slot + 1:
+        while self._next_point >= 0 and self._is_complete(self._next_point, is_over):
             begin = self._next_point * self.steps_per_point
             self.points.append(self._point(begin, begin + self.steps_per_point))
             if self.settled < 0 and self.points[-1][_DEVIATION] < TOLERANCE:
@@ -185,6 +187,14 @@ class LiveLoop:
         if surplus > 0:
             del self.points[:surplus]
             self.points_before += surplus
+
+    def _is_complete(self, number: int, is_over: bool) -> bool:
+        """Are the messages of a point's steps here, or not to be waited for any longer?"""
+        end, seen = (number + 1) * self.steps_per_point, self._last_slot + 1
+        if seen < end + (0 if is_over else _BEHIND * self.steps_per_point):
+            return False
+        answered = not self.command_slots or self._last_command_slot + 1 >= end
+        return is_over or answered or seen >= end + _MOST_BEHIND * self.steps_per_point
 
     def _point(self, begin: int, end: int) -> list[float]:
         rows = self.ring.rows(begin, end)

@@ -13,9 +13,12 @@ from agv_analysis.bags.rosbag2_metadata import TopicInfo
 from agv_analysis.bags.writer import NODES_NAME, BagWriter
 from agv_analysis.scenario import Scenario
 from agv_analysis.version import version
+from agv_analysis.watch.live_loop import DIAGNOSTICS, TOPICS
 from agv_analysis.watch.message_log import MessageLog
 from agv_ros.codec import stamp_of
 from agv_ros.ros_yaml import dump
+
+_OF_EVERY_STEP = ("edge/slot", "agv/pose", "edge/error", "edge/cmd_vel")
 
 
 def save_bag(
@@ -33,8 +36,11 @@ def save_bag(
     by_stamp = scenario.plant.clock == "lockstep"
     writer = BagWriter(directory, [partial(known.__getitem__, i) for i in range(len(known))], about, by_stamp)
     try:
+        first_ns, last_ns = _of_all_topics(log)
         for topic, data, received_ns in log.messages():
             stamp_ns = max(0, stamp_of(data))
+            if topic != DIAGNOSTICS and not first_ns <= stamp_ns <= last_ns:
+                continue
             writer.write(topic, data, stamp_ns if by_stamp else received_ns, stamp_ns)
         writer.add_metadata(NODES_NAME, {"params": dump(_sections(scenario)), **nodes})
         writer.close()
@@ -42,6 +48,20 @@ def save_bag(
         writer.abandon()
         raise
     return sum(writer.counts)
+
+
+def _of_all_topics(log: MessageLog) -> tuple[int, int]:
+    """From which stamp [ns] to which one each topic that has a message of every step is heard.
+
+    Before and after it some topics lack what others have, only since they were connected or taken from one by one.
+    """
+    heard: dict[int, list[int]] = {}
+    for topic, data, _ in log.messages():
+        if TOPICS[topic] in _OF_EVERY_STEP:
+            heard.setdefault(topic, []).append(stamp_of(data))
+    if not heard:
+        return 0, 2**63 - 1
+    return max(map(min, heard.values())), min(map(max, heard.values()))
 
 
 def _sections(scenario: Scenario) -> dict[str, dict[str, dict[str, object]]]:

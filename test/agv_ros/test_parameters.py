@@ -177,6 +177,7 @@ def test_what_can_change_while_running() -> None:
             "jitter",
             "duplicate",
             "lifetime",
+            "schedule",
         )
     }
     assert changing == gains | losses
