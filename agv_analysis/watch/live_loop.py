@@ -21,8 +21,8 @@ from agv_ros.messages import DELAYED, LOST, InvalidMessageError
 from agv_ros.stamps import to_nanoseconds
 
 TOPICS = ("edge/slot", "agv/slot", "agv/pose", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "/diagnostics")
-"""What is heard; the number of a topic is its place here. They are taken from in this order: a slot is published after its
-message, so the message of each slot is here by then."""
+"""What is heard; the number of a topic is its place here. They are taken from in this order: a slot is published after
+its message, so the message of each slot is here by then."""
 
 DIAGNOSTICS = TOPICS.index("/diagnostics")
 

@@ -36,6 +36,9 @@ class RemoteParameters:
         sides = {id(side): self._beside(side) for side in (agv, edge)}
         self._nodes = list(sides.values())
         self._at = {name: sides[id(edge if name in ("error_detector", "controller") else agv)] for name in PUBLISHERS}
+        self._setters: dict[str, Any] = {}
+        self.longest_answer = 0.0
+        """The longest time [s] that a node took to set a parameter."""
         self._clients = {name: ParameterClient(self._at[name], topic) for name, topic in PUBLISHERS.items()}
 
     def _beside(self, side: Node) -> Node:
@@ -62,6 +65,8 @@ class RemoteParameters:
                     client.ask_again()
             if not self._spin_until(self._have_answered):
                 return None
+            for name in self._clients:  # so that they are connected when a parameter is to be set
+                self._setter_of(name)
             found = {name: client.again.get(client.restarts, client.values) for name, client in self._clients.items()}
         values = {
             name: {key: value for key, value in (found[name] or {}).items() if key in parameters_of(SCHEMAS[name])}
@@ -69,6 +74,12 @@ class RemoteParameters:
         }
         text = dump({name: {"ros__parameters": known} for name, known in values.items()})
         return parse_scenario(text, "the parameters of the running nodes")
+
+    def _setter_of(self, node: str) -> Any:
+        if node not in self._setters:
+            where = f"{self._clients[node].name}/set_parameters"
+            self._setters[node] = self._at[node].create_client(SetParameters, where)
+        return self._setters[node]
 
     def _have_answered(self) -> bool:
         answered = [client.ask() for client in self._clients.values()]  # each is to be asked
@@ -87,16 +98,15 @@ class RemoteParameters:
             self._spin_until(lambda: bool(client.name) or client.ask())
             if not client.name:
                 raise ParameterError(f"no {node} is to be seen: is it running?")
-            service = self._at[node].create_client(SetParameters, f"{client.name}/set_parameters")
-            try:
-                if not self._spin_until(service.service_is_ready):
-                    raise ParameterError(f"{client.name} does not offer to set its parameters")
-                request = SetParameters.Request(parameters=[RosParameter(name, value=value).to_parameter_msg()])
-                answer = service.call_async(request)
-                if not self._spin_until(answer.done):
-                    raise ParameterError(f"{client.name} has not answered within {_PATIENCE:g} s: does it run?")
-            finally:
-                self._at[node].destroy_client(service)
+            service = self._setter_of(node)
+            if not self._spin_until(service.service_is_ready):
+                raise ParameterError(f"{client.name} does not offer to set its parameters: does it run?")
+            begin = time.monotonic()
+            request = SetParameters.Request(parameters=[RosParameter(name, value=value).to_parameter_msg()])
+            answer = service.call_async(request)
+            if not self._spin_until(answer.done):
+                raise ParameterError(f"{client.name} has not answered within {_PATIENCE:g} s: does it run?")
+            self.longest_answer = max(self.longest_answer, time.monotonic() - begin)
         (result,) = answer.result().results
         if not result.successful:
             raise ParameterError(result.reason or f"{client.name} refuses {name}={value}")

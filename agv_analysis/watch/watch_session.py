@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 TICK = 0.05
 """Time [s] between two frames."""
 
-_LEAD = 0.3
-"""An outage that is asked for begins this much later [s], when the relay is sure to know of it."""
+_LEAD = 0.4
+"""An outage that is asked for begins at least this much later [s], when the relay should know of it."""
 
 _LEAST_REST, _SHARE = 1.0, 9.0
 """Between two margins pass a second and so many times what the last one took [s]: a tenth of a core at most."""
@@ -67,10 +67,11 @@ class WatchSession:
         """How often the loop has begun anew, and its parameters have been others."""
         self._deadlines: dict[str, str] = {}
         self._changes: dict[tuple[str, str], str] = {}
-        self._is_stale = scenario is None
+        self._is_stale = True
+        """Are the nodes to be asked for their parameters?"""
         self._is_over = False
         self._last_slot_at = time.monotonic()
-        self._rate, self._rate_of = 1.0, (0.0, 0)
+        self._rate, self._rate_of = 0.0, (time.monotonic(), 0)
         self._remote = remote
         self._compute: LatestOnlyWorker[LinkMargin] = LatestOnlyWorker(link_margin)
         self._threads = [threading.Thread(target=work) for work in (self._keep_parameters, self._keep_margin)]
@@ -122,6 +123,7 @@ class WatchSession:
                 if self.loop.k != before:
                     self._last_slot_at = time.monotonic()
                 self.loop.make_points(self._is_over)
+                self._measure_rate(self.loop)
             self.frames += 1
             self.changed.notify_all()
 
@@ -260,7 +262,8 @@ class WatchSession:
         """Lose the next slots of the uplink, or all for some seconds. Raises ParameterError."""
         with self.changed:
             loop = self._known()
-            begin = loop.k + 1 + math.ceil(_LEAD * max(1.0, self._steps_per_second(loop)))
+            lead = max(_LEAD, 2.0 * self._remote.longest_answer)
+            begin = loop.k + 1 + math.ceil(lead * max(1.0 / loop.ts, self._rate))
             count = slots if slots is not None else max(1, round(seconds / loop.ts))
             schedule = with_outage(loop.scenario.relay.uplink, begin, count, loop.ts)
         self._remote.set("relay", "uplink.schedule", schedule)
@@ -268,19 +271,19 @@ class WatchSession:
             values = as_dict(loop.scenario.relay) | {"uplink.schedule": schedule}
             loop.scenario = loop.scenario.with_values({"relay": values})
         self._is_stale = True
-        late = "" if loop.k < begin else ", of which some had passed before the relay knew"
+        late = (
+            ""
+            if loop.k < begin
+            else f", but the relay may have known of it only at slot {loop.k}: those before went on"
+        )
         return f"slots {begin} to {begin + count - 1} ({begin * loop.ts:.3f} s on) are lost{late}"
 
-    def _steps_per_second(self, loop: LiveLoop) -> float:
-        at, k = self._rate_of
-        now = time.monotonic()
-        if now - at > 1.0 or loop.k < k:
+    def _measure_rate(self, loop: LiveLoop) -> None:
+        """Once a second: how many steps does the loop take in a second?"""
+        (at, k), now = self._rate_of, time.monotonic()
+        if now - at >= 1.0 or loop.k < k:
+            self._rate = max(0.0, (loop.k - k) / (now - at))
             self._rate_of = now, loop.k
-            if 0.0 < now - at < 30.0 and loop.k > k:
-                self._rate = (loop.k - k) / (now - at)
-            else:
-                self._rate = 1.0 / loop.ts if loop.scenario.plant.clock == "realtime" else 3000.0
-        return self._rate
 
     def save(self) -> str:
         """Write what was heard so far to a new bag. Raises UserError, OSError."""
