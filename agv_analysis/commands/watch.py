@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import click
@@ -19,10 +20,9 @@ from agv_analysis.commands import needs_ros
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address of this machine to serve the page on.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8051, show_default=True, help="0: any free one.")
 @click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
-@click.option("--of-run", is_flag=True, hidden=True, help="The page belongs to a run: its button stop says so here.")
 def command(
     namespace: str, config: Path | None, plant_domain: int | None, edge_domain: int | None, save_to: Path, host: str,
-    port: int, no_browser: bool, of_run: bool,
+    port: int, no_browser: bool,
 ) -> None:  # fmt: skip
     """Watch a running loop in the browser: track, deviation, speed, losses, and what they say of it. Ctrl-C stops it.
 
@@ -37,9 +37,10 @@ def command(
     """
     with needs_ros():
         from agv_analysis.watch.watcher_node import watch
-    from agv_analysis.watch.beside_run import SERVED, STOP
+    from agv_analysis.watch.beside_run import OF_RUN, SERVED, STOP
     from agv_ros.discovery import discovery_note
 
+    of_run = OF_RUN in os.environ
     if not of_run:
         click.echo(discovery_note(), err=True)
 

@@ -17,6 +17,9 @@ from agv_ros.errors import UserError
 SERVED, STOP = "watch: ", "stop"
 """What the watcher prints: before the page's address, and when its button stop is pressed."""
 
+OF_RUN = "AGV_NCS_WATCHES_ITS_RUN"
+"""Environment variable of a watcher whose run listens to what it prints."""
+
 _NICE = 5
 """The page yields to the loop."""
 
@@ -39,11 +42,11 @@ def watcher_beside(
     domains = [word for option, domain in sides if domain >= 0 for word in (option, str(domain))]
     command = [
         sys.executable, "-m", "agv_analysis.cli", "watch", "--config", str(params), "--host", host, "--port",
-        str(port), "--no-browser", "--of-run", *domains,
+        str(port), "--no-browser", *domains,
     ]  # fmt: skip
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        start_new_session=True, env={**os.environ, "PYTHONUNBUFFERED": "1", ENDS_WITH_STDIN: "1"},
+        start_new_session=True, env={**os.environ, "PYTHONUNBUFFERED": "1", ENDS_WITH_STDIN: "1", OF_RUN: "1"},
     )  # fmt: skip
     assert process.stdout is not None
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +28,8 @@ class LinkMargin(NamedTuple):
     probability_stable: float | None = None
     growth: float | None = None
     """Of the mean square of small errors, logarithm per step."""
-    guaranteed: int | None = None
-    """Outages up to this length [slots] are survived in any order; None: not known, or there is no limit."""
+    guaranteed: float | None = None
+    """Outages up to this length [slots] are survived in any order; inf: any are, None: not known."""
     slots: int = 0
     """Slots that were judged."""
 
@@ -45,7 +46,7 @@ def link_margin(params: str, k: NDArray[np.int64], lost: NDArray[np.bool_], not_
     except UserError as error:
         return LinkMargin(NOT_COVERED, str(error), slots=len(k))
     if not_covered:
-        return LinkMargin(NOT_COVERED, not_covered, guaranteed=guaranteed, slots=len(k))
+        return LinkMargin(NOT_COVERED, not_covered, slots=len(k))
     if not len(k):
         return LinkMargin(UNDECIDED, "nothing was seen of the link yet", guaranteed=guaranteed)
     found = link_confidence(loop_on_lap(scenario), k, lost, scenario.plant.ts)
@@ -55,8 +56,9 @@ def link_margin(params: str, k: NDArray[np.int64], lost: NDArray[np.bool_], not_
 
 
 @functools.lru_cache(maxsize=8)
-def _of_loop(params: str) -> tuple[Scenario, int | None]:
-    """The scenario, and the longest outages that its loop survives in any order; None: any. Raises UserError."""
+def _of_loop(params: str) -> tuple[Scenario, float]:
+    """The scenario, and the longest outages that its loop survives in any order; inf: any. Raises UserError."""
     scenario = parse_scenario(params, "the loop's parameters")
     loop = loop_on_lap(scenario)
-    return scenario, largest_n(loop, longest_for(loop))[0]
+    guaranteed, _ = largest_n(loop, longest_for(loop))
+    return scenario, math.inf if guaranteed is None else guaranteed

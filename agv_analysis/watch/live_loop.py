@@ -59,7 +59,9 @@ class LiveLoop:
         self.most_points = round(60.0 * MINUTES / (self.steps_per_point * plant.ts))
         self._ts_ns, self._start_ns = to_nanoseconds(plant.ts), to_nanoseconds(plant.start_time)
         self._on_grid = scenario.relay.stamps == "grid"
-        self._reference = None if detector.track == PATH else Reference(detector)
+        self._is_timed = detector.trigger == "timer"
+        is_known = detector.track != PATH and self._on_grid and not self._is_timed
+        self._reference = Reference(detector) if is_known else None
         decode = decode_odometry if scenario.relay.pose_type == ODOMETRY else decode_pose
         command = TOPICS.index("edge/cmd_vel" if scenario.relay.command_type == TWIST else "agv/cmd_vel")
         self._on: dict[int, Callable[[bytes], None]] = {
@@ -165,7 +167,8 @@ class LiveLoop:
     def deviations(self, begin: int, end: int) -> Floats:
         """Distance of the AGV's poses from the reference [m] at the steps begin .. end - 1, shape (end - begin,).
 
-        On a planner's path, which is not known here, the tracking error where the edge had a fresh pose; NaN elsewhere.
+        On a planner's path, or of a robot with a clock of its own, the reference of a step is not known here: there it
+        is the tracking error where the edge had a fresh pose, and NaN elsewhere.
         """
         rows = self.ring.rows(begin, end)
         if self._reference is None:
@@ -216,6 +219,8 @@ class LiveLoop:
 
     def not_covered(self) -> str:
         """Why the links are none of which the margin knows; empty if they are."""
+        if self._is_timed:
+            return "the edge steps by its own clock: save the bag, and agv-ncs analyse judges it"
         if self.commands_lost:
             return "commands are lost as well: save the bag, and agv-ncs analyse judges both links"
         if self.delayed:

@@ -115,7 +115,9 @@ def _outage(loop: LiveLoop, margin: LinkMargin | None) -> LiveTile:
     note = "guaranteed limit: not known"
     if margin is not None and margin.guaranteed is not None and margin.guaranteed >= 0:
         mood = GOOD if longest <= margin.guaranteed else FAIR
-        note = f"guaranteed limit: {margin.guaranteed} slots"
+        note = f"guaranteed limit: {margin.guaranteed:g} slots"
+        if math.isinf(margin.guaranteed):
+            note = "any length is survived"
     return LiveTile("outage", "Longest outage", value, note, mood)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -13,10 +14,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from agv_analysis.runtime.parameter_client_node import ParameterClient
-from agv_analysis.runtime.recorder_node import PUBLISHERS
 from agv_analysis.scenario import SCHEMAS, Scenario, parse_scenario
-from agv_ros.parameters import ParameterError, parameters_of
+from agv_ros.parameters import SHARED, ParameterError, parameters_of
 from agv_ros.ros_yaml import dump
+
+_PUBLISHERS = {"plant": "agv/pose", "relay": "agv/slot", "error_detector": "edge/error", "controller": "edge/cmd_vel"}
+"""The topic by which each node of the loop is known, in the DDS domain in which its services are."""
 
 _PATIENCE = 3.0
 """How long [s] a node may take to answer."""
@@ -35,11 +38,13 @@ class RemoteParameters:
         self._executors: list[SingleThreadedExecutor] = []
         sides = {id(side): self._beside(side) for side in (agv, edge)}
         self._nodes = list(sides.values())
-        self._at = {name: sides[id(edge if name in ("error_detector", "controller") else agv)] for name in PUBLISHERS}
+        self._at = {name: sides[id(edge if name in ("error_detector", "controller") else agv)] for name in _PUBLISHERS}
         self._setters: dict[str, Any] = {}
         self.longest_answer = 0.0
         """The longest time [s] that a node took to set a parameter."""
-        self._clients = {name: ParameterClient(self._at[name], topic) for name, topic in PUBLISHERS.items()}
+        self.is_plant_assumed = False
+        """Is there a robot in place of the plant, of which nothing is known?"""
+        self._clients = {name: ParameterClient(self._at[name], topic) for name, topic in _PUBLISHERS.items()}
 
     def _beside(self, side: Node) -> Node:
         node = Node(
@@ -57,21 +62,28 @@ class RemoteParameters:
     def ask(self, again: bool = False) -> Scenario | None:
         """The parameters as the nodes have them now; None as long as not all have answered.
 
-        Raises ParameterError if they are not those of this package's nodes.
+        A robot in place of the plant need not answer: then the plant's parameters are the defaults, in real time.
+        Raises ParameterError if those of the others are not those of this package's nodes.
         """
         with self._lock:
             if again:
                 for client in self._clients.values():
                     client.ask_again()
-            if not self._spin_until(self._have_answered):
-                return None
-            for name in self._clients:  # so that they are connected when a parameter is to be set
-                self._setter_of(name)
+            self._spin_until(self._have_answered)
             found = {name: client.again.get(client.restarts, client.values) for name, client in self._clients.items()}
+            if any(values is None for name, values in found.items() if name != "plant"):
+                return None
+            for name, values in found.items():  # so that they are connected when a parameter is to be set
+                if values is not None:
+                    self._setter_of(name)
         values = {
             name: {key: value for key, value in (found[name] or {}).items() if key in parameters_of(SCHEMAS[name])}
             for name in SCHEMAS
         }
+        self.is_plant_assumed = not values["plant"]
+        if self.is_plant_assumed:
+            shared = {key: value for key, value in values["relay"].items() if key in SHARED}
+            values["plant"] = {**shared, "clock": "realtime", "duration": math.inf}
         text = dump({name: {"ros__parameters": known} for name, known in values.items()})
         return parse_scenario(text, "the parameters of the running nodes")
 

@@ -234,7 +234,9 @@ class WatchSession:
             return self._refusal or "waiting for the parameters of the loop's nodes: do they run, and in this domain?"
         if self.loop.k < 0:
             return "waiting for the loop to begin"
-        return f"nothing has come for {quiet:.0f} s" if quiet > _QUIET else ""
+        if quiet > _QUIET:
+            return f"nothing has come for {quiet:.0f} s"
+        return "the plant did not tell its parameters: its defaults are taken" if self._remote.is_plant_assumed else ""
 
     def _setup(self, loop: LiveLoop) -> dict[str, Any]:
         scenario = loop.scenario
@@ -262,6 +264,8 @@ class WatchSession:
         """Lose the next slots of the uplink, or all for some seconds. Raises ParameterError."""
         with self.changed:
             loop = self._known()
+            if loop.scenario.relay.stamps != "grid":
+                raise ParameterError("the relay's numbers of the slots are not known here: the stamps are on no grid")
             lead = max(_LEAD, 2.0 * self._remote.longest_answer)
             begin = loop.k + 1 + math.ceil(lead * max(1.0 / loop.ts, self._rate))
             count = slots if slots is not None else max(1, round(seconds / loop.ts))
