@@ -18,7 +18,7 @@ from agv_cloud.reference.reference import Reference
 from agv_ros.codec import decode_command, decode_error, decode_odometry, decode_pose, decode_slot
 from agv_ros.message_types import ODOMETRY, TWIST
 from agv_ros.messages import DELAYED, LOST, InvalidMessageError
-from agv_ros.stamps import to_nanoseconds
+from agv_ros.stamps import AGREEING, to_nanoseconds
 
 TOPICS = ("edge/slot", "agv/slot", "agv/pose", "edge/error", "edge/cmd_vel", "agv/cmd_vel", "/diagnostics")
 """What is heard; the number of a topic is its place here. They are taken from in this order: a slot is published after
@@ -39,6 +39,10 @@ speed [m/s] and the largest age [s] in it; slots of up- and downlink that were l
 _MOST_STEPS = 2_000_000
 """Steps that are kept at most, in 180 MB."""
 
+FAR = 60.0
+"""A stamp so far [s] after the newest slot is not believed, unless others agree: not a node's window, as here messages
+may be missed."""
+
 _DEVIATION = POINTS.index("deviation")
 
 _RECENT = 20
@@ -58,6 +62,7 @@ class LiveLoop:
         self.steps_per_point = max(1, round(POINT_SECONDS / plant.ts))
         self.most_points = round(60.0 * MINUTES / (self.steps_per_point * plant.ts))
         self._ts_ns, self._start_ns = to_nanoseconds(plant.ts), to_nanoseconds(plant.start_time)
+        self._window = math.ceil(FAR / plant.ts)
         self._on_grid = scenario.relay.stamps == "grid"
         self._is_timed = detector.trigger == "timer"
         is_known = detector.track != PATH and self._on_grid and not self._is_timed
@@ -94,7 +99,10 @@ class LiveLoop:
         """Points that are kept no longer."""
         self._last_slot = self._last_command_slot = -1
         self._next_point = -1
+        self._newest_ns = 0
         self._origin_ns = self._start_ns if self._on_grid else -1
+        self._beyond = 0
+        """Slots in a row that are far after the newest one."""
 
     @property
     def k(self) -> int:
@@ -118,6 +126,8 @@ class LiveLoop:
         k = (stamp_ns - self._origin_ns + self._ts_ns // 2) // self._ts_ns
         if k < 0:
             raise InvalidMessageError(f"stamp {stamp_ns} is before the first step")
+        if 0 <= self._last_slot < k - self._window and self._beyond < AGREEING:
+            raise InvalidMessageError(f"stamp {stamp_ns} is far after that of the newest slot")
         return k
 
     def _on_pose(self, stamp_ns: int, x: float, y: float, theta: float) -> None:
@@ -125,6 +135,8 @@ class LiveLoop:
 
     def _on_slot(self, data: bytes) -> None:
         slot = decode_slot(data)
+        is_beyond = slot.stamp_ns > self._newest_ns + self._window * self._ts_ns
+        self._beyond = self._beyond + 1 if is_beyond and self._last_slot >= 0 else 0
         k, lost = self._step(slot.stamp_ns), slot.outcome == LOST
         if k == 0 and self._last_slot > 0:  # the loop has begun anew
             self.restarts += 1
@@ -137,7 +149,7 @@ class LiveLoop:
             self.first, self._last_slot = k, k - 1
             self._next_point = -(-k // self.steps_per_point)
         self.skipped += k - self._last_slot - 1
-        self._last_slot = k
+        self._last_slot, self._newest_ns = k, slot.stamp_ns
         self.slots += 1
         self.lost += lost
         self.delayed += slot.outcome == DELAYED
@@ -180,6 +192,8 @@ class LiveLoop:
 
     def make_points(self, is_over: bool = False) -> None:
         """Append the points whose steps are complete; of a loop that is over all but a part of one."""
+        if self._next_point >= 0:  # of a long gap what is kept
+            self._next_point = max(self._next_point, self._last_slot // self.steps_per_point - self.most_points)
         while self._next_point >= 0 and self._is_complete(self._next_point, is_over):
             begin = self._next_point * self.steps_per_point
             self.points.append(self._point(begin, begin + self.steps_per_point))

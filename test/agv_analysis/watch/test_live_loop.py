@@ -16,7 +16,7 @@ from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import analyse
 from agv_analysis.watch.controls import controls_of
 from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, link_margin
-from agv_analysis.watch.live_loop import POINTS, TOPICS, LiveLoop
+from agv_analysis.watch.live_loop import FAR, POINTS, TOPICS, LiveLoop
 from agv_analysis.watch.live_tiles import live_tiles
 from agv_analysis.watch.message_log import Heard, MessageLog
 from agv_analysis.watch.outage_order import with_outage
@@ -104,6 +104,22 @@ def test_what_is_not_seen_is_counted_and_not_made_up() -> None:
     assert f"{loop.skipped} slots not seen" in next(
         tile.note for tile in live_tiles(loop, None, {}) if tile.key == "losses"
     )
+
+
+def test_a_wild_stamp_is_refused_and_a_loop_that_has_leapt_is_followed() -> None:
+    loop, grid = LiveLoop(scenario()), scenario().grid
+    window = round(FAR / scenario().plant.ts)
+
+    def slots(*steps: int) -> None:
+        slots = (Slot(grid.stamp(k), grid.stamp(k), DELIVERED) for k in steps)
+        loop.take(Heard(TOPICS.index("edge/slot"), encode_slot(slot), slot.stamp_ns) for slot in slots)
+
+    slots(*range(5), 10 * window, *range(5, 8))
+    assert (loop.k, loop.slots, loop.rejected["edge/slot"]) == (7, 8, 1)
+    slots(*range(10 * window, 10 * window + 20))
+    assert loop.k == 10 * window + 19
+    loop.make_points()
+    assert len(loop.points) <= loop.most_points
 
 
 def test_a_loop_that_begins_anew_is_told_from_late_messages(seen: LiveLoop) -> None:
