@@ -87,6 +87,16 @@ class RemoteParameters:
         text = dump({name: {"ros__parameters": known} for name, known in values.items()})
         return parse_scenario(text, "the parameters of the running nodes")
 
+    def connect(self) -> bool:
+        """Look for the nodes, so that their parameters can be set at once; is each of them found? Asks them nothing."""
+        with self._lock:
+            for name, client in self._clients.items():
+                if not client.name:
+                    client.ask()  # which only looks, as long as it has not found the node
+                if client.name:
+                    self._setter_of(name)
+            return len(self._setters) == len(self._clients)
+
     def _setter_of(self, node: str) -> Any:
         if node not in self._setters:
             where = f"{self._clients[node].name}/set_parameters"

@@ -67,7 +67,7 @@ class WatchSession:
         """How often the loop has begun anew, and its parameters have been others."""
         self._deadlines: dict[str, str] = {}
         self._changes: dict[tuple[str, str], str] = {}
-        self._is_stale = True
+        self._is_stale = scenario is None
         """Are the nodes to be asked for their parameters?"""
         self._is_over = False
         self._last_slot_at = time.monotonic()
@@ -143,8 +143,9 @@ class WatchSession:
 
     def _keep_parameters(self) -> None:
         """Body of a thread: ask the nodes for their parameters when they are not known, or have been changed."""
-        is_asked = False
+        is_asked = is_connected = False
         while not self.is_closed:
+            is_connected = is_connected or self._remote.connect()
             if self._is_stale:
                 self._is_stale = False
                 try:
