@@ -7,11 +7,14 @@ from typing import NamedTuple
 
 from agv_analysis.corridor.widths import widths_of
 from agv_analysis.metrics.bands import TOLERANCE
-from agv_analysis.watch.link_margin import STABLE, UNSTABLE, LinkMargin
+from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin
 from agv_analysis.watch.live_loop import POINTS, LiveLoop
 
 LOOK_BACK = 60.0
 """Time [s] of the loop over which the largest deviation is said."""
+
+_MOST_MISSED = 0.01
+"""Share of missed deadlines above which losses alone do not say how old commands were."""
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 
@@ -30,7 +33,7 @@ def live_tiles(loop: LiveLoop, margin: LinkMargin | None, deadlines: dict[str, s
     """The figures of a loop now."""
     largest = recent_deviation(loop)
     return [
-        _verdict(margin), _deviation(loop, largest), _corridor(loop, largest), _losses(loop), _outage(loop, margin),
+        _verdict(margin, deadlines), _deviation(loop, largest), _corridor(loop, largest), _losses(loop), _outage(loop, margin),
         _age(loop), _speed(loop), _deadlines(loop, deadlines),
     ]  # fmt: skip
 
@@ -48,8 +51,12 @@ def recent_deviation(loop: LiveLoop) -> float:
     return max(known, default=math.nan)
 
 
-def _verdict(margin: LinkMargin | None) -> LiveTile:
+def _verdict(margin: LinkMargin | None, deadlines: dict[str, str]) -> LiveTile:
     label = "Loop on this link"
+    missed, steps = int(deadlines.get("missed deadlines", "0")), int(deadlines.get("step", "0"))
+    if margin is not None and margin.word == STABLE and missed > _MOST_MISSED * steps:
+        why = f"{missed} of {steps} deadlines were missed: commands acted later than the losses say"
+        return LiveTile("word", label, NOT_COVERED, why, FAIR)
     if margin is None:
         return LiveTile("word", label, "…", "computing")
     if margin.probability_stable is None:

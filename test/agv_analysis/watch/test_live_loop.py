@@ -15,7 +15,7 @@ from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import analyse
 from agv_analysis.watch.controls import controls_of
-from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, link_margin
+from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin, link_margin
 from agv_analysis.watch.live_loop import FAR, POINTS, TOPICS, LiveLoop
 from agv_analysis.watch.live_tiles import live_tiles
 from agv_analysis.watch.message_log import Heard, MessageLog
@@ -141,6 +141,15 @@ def test_the_tiles_say_what_the_analysis_says(seen: LiveLoop) -> None:
     assert tiles["deviation"].note == f"at most {largest:.3f} m in the last 10 s"
     assert tiles["corridor"].value == f"0.25 m: {'left' if largest > 0.25 else 'kept'}"
     assert tiles["deadlines"].value == "3"
+
+
+def test_nothing_is_called_stable_whose_commands_came_late(seen: LiveLoop) -> None:
+    margin = LinkMargin(STABLE, "", probability_stable=0.999, slots=2000)
+    word = {
+        missed: live_tiles(seen, margin, {"missed deadlines": missed, "step": "2000"})[0].value
+        for missed in ("20", "21")
+    }
+    assert word == {"20": STABLE, "21": NOT_COVERED}
 
 
 def test_a_link_that_the_loop_cannot_take_is_called_so() -> None:
