@@ -33,8 +33,8 @@ def live_tiles(loop: LiveLoop, margin: LinkMargin | None, deadlines: dict[str, s
     """The figures of a loop now."""
     largest = recent_deviation(loop)
     return [
-        _verdict(margin, deadlines), _deviation(loop, largest), _corridor(loop, largest), _losses(loop), _outage(loop, margin),
-        _age(loop), _speed(loop), _deadlines(loop, deadlines),
+        _verdict(margin, deadlines), _deviation(loop, largest), _corridor(loop, largest), _losses(loop),
+        _outage(loop, margin), _age(loop), _speed(loop), _deadlines(loop, deadlines),
     ]  # fmt: skip
 
 
