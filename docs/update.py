@@ -41,6 +41,8 @@ def parameters_page() -> str:
 
 def paper_page(out: str) -> str:
     """docs/paper.md; the paper is reproduced in the directory `out`."""
+    from agv_analysis.output_file import MARKDOWN_MARK
+
     command("reproduce", "--out", out)
     return (
         "# The paper's claims\n\nMade by `agv-ncs reproduce`, which also draws the paper's figures. Every value is "
@@ -50,7 +52,7 @@ def paper_page(out: str) -> str:
         "K_theta: the scenario is a choice.\n\nAn error has settled when less than 1 cm is left of it, a command when "
         "`v - v_r` stays within 2 % of its largest value. Steps count from k = 0. Twins are two AGVs that begin a "
         "micrometre apart and meet the same losses; their number is their distance at the end as a multiple of that at "
-        "the beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8")
+        "the beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8").removesuffix(MARKDOWN_MARK)
     )
 
 

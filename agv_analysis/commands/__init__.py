@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import FORCE, JSON_MARK, output_file
 
 if TYPE_CHECKING:
     from agv_analysis.corridor.corridor_of_run import CorridorOfRun
@@ -86,6 +87,33 @@ def corridor_json(within: CorridorOfRun | None) -> dict[str, Any]:
     return {} if within is None else {"corridor": within.to_json()}
 
 
+class OutputFile(click.Path):
+    """A file to be written: that it may be is known before the command begins its work."""
+
+    def __init__(self, allow_dash: bool = False) -> None:
+        """`allow_dash`: - is the standard output."""
+        super().__init__(path_type=Path, allow_dash=allow_dash)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """The path. Raises UserError for one that `output_file` refuses."""
+        return output_file(Path(os.fsdecode(super().convert(value, param, ctx))))
+
+
+OUTPUT = OutputFile()
+
+
+def with_force(command: F) -> F:
+    """The option --force of commands that write files; `output_file` heeds it."""
+
+    def note(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+        ctx.meta[FORCE] = value
+
+    return click.option(
+        "--force", is_flag=True, is_eager=True, expose_value=False, callback=note,
+        help="Overwrite files that are no earlier outputs of this program.",
+    )(command)  # fmt: skip
+
+
 @contextmanager
 def needs_ros(otherwise: str = "") -> Iterator[None]:
     """Where something is imported that needs ROS 2: without it the command ends with a line that says so.
@@ -104,7 +132,9 @@ def needs_ros(otherwise: str = "") -> Iterator[None]:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write a JSON file; a path that cannot be written is the user's error."""
     try:
-        output_file(path).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        output_file(path).write_text(
+            json.dumps({**JSON_MARK, **content}, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+        )
     except OSError as error:
         raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -114,9 +144,7 @@ def with_report(command: F) -> F:
     command = click.option(
         "--figures", type=click.Path(path_type=Path), help="Draw each plot to this directory, as SVG and PDF."
     )(command)
-    return click.option("--report", type=click.Path(path_type=Path), help="Write a page for the browser to this file.")(
-        command
-    )
+    return click.option("--report", type=OUTPUT, help="Write a page for the browser to this file.")(command)
 
 
 def report_on(

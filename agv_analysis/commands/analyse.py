@@ -7,11 +7,13 @@ from pathlib import Path
 import click
 
 from agv_analysis.commands import (
+    OUTPUT,
     corridor_json,
     corridor_settings,
     print_corridor,
     report_on,
     with_corridor,
+    with_force,
     with_report,
     write_json,
 )
@@ -19,12 +21,12 @@ from agv_analysis.commands import (
 
 @click.command("analyse")
 @click.argument("bag", type=click.Path(path_type=Path))
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
 @click.option(
     "--config", type=click.Path(path_type=Path), help="The run's params file, for a bag that does not carry it."
 )
 @click.option("--namespace", help="Which loop, for a bag of several.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Where to draw; beside the recording by default.")
+@click.option("--picture", type=OUTPUT, help="Where to draw; beside the recording by default.")
 @click.option("--pose-topic", help="Another robot's pose: Odometry, PoseWithCovarianceStamped, PoseStamped, or /tf.")
 @click.option("--pose-frames", nargs=2, metavar="FIXED ROBOT", help="Of /tf: which frames, as map base_link.")
 @click.option("--command-topic", help="Another robot's command: Twist, TwistStamped or AckermannDrive(Stamped).")
@@ -33,6 +35,7 @@ from agv_analysis.commands import (
 @click.option("--topics", type=click.Path(path_type=Path), help="YAML file with the topics: pose, command, reference.")
 @with_corridor
 @with_report
+@with_force
 def command(
     bag: Path, json_file: Path | None, config: Path | None, namespace: str | None, picture: Path | None,
     pose_topic: str | None, pose_frames: tuple[str, str] | None, command_topic: str | None,
@@ -58,7 +61,7 @@ def command(
     from agv_analysis.report.table import print_table
     from agv_analysis.stability.analysis import analyse, observe
 
-    where = output_file(picture or (bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png")))
+    where = picture or output_file(bag / "overview.png" if bag.is_dir() else bag.with_suffix(".png"))
     if any((pose_topic, command_topic, reference_topic, track_file, topics)):
         if namespace is not None:
             raise click.UsageError("--namespace chooses one of several loops; another robot's topics are named in full")

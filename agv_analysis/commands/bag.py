@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from agv_analysis.commands import write_json
+from agv_analysis.commands import OUTPUT, with_force, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.bags import Bag
@@ -35,7 +35,8 @@ _DEFINITIONS = click.option(
 @command.command("info")
 @click.argument("bag", type=click.Path(path_type=Path))
 @_DEFINITIONS
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
+@with_force
 def info(bag: Path, definitions: Path | None, json_file: Path | None) -> None:
     """Show what BAG holds, and everything that is wrong with it.
 
@@ -129,9 +130,10 @@ def recover(bag: Path, out: Path, definitions: Path | None) -> None:
 @click.option("--topic", required=True, help="Whose messages: of any type with a header, or of any other.")
 @click.option("--period", type=click.FloatRange(min=0.0, min_open=True), help="Time between messages sent [s].")
 @_DEFINITIONS
-@click.option("--trace", type=click.Path(path_type=Path), help="Write a file for the channel trace, with times.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Draw the outages to this file.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+@click.option("--trace", type=OUTPUT, help="Write a file for the channel trace, with times.")
+@click.option("--picture", type=OUTPUT, help="Draw the outages to this file.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write the figures to this file, too.")
+@with_force
 def outages(
     bag: Path, topic: str, period: float | None, definitions: Path | None, trace: Path | None, picture: Path | None,
     json_file: Path | None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from agv_analysis.commands import with_settings, write_json
+from agv_analysis.commands import OUTPUT, with_force, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.link.channel_study import ChannelStudy
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     "--from-netem", metavar="LINE", help='Use netem\'s channel, as in "delay 20ms loss 5% 25%", or a pasted tc line.'
 )
 @click.option("--netem", is_flag=True, help="Print the channel as an option of `tc qdisc ... netem`, and nothing else.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
-@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the distribution of n_ul to this file.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Draw the channel to this file.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write the figures to this file, too.")
+@click.option("--csv", "csv_file", type=OUTPUT, help="Write the distribution of n_ul to this file.")
+@click.option("--picture", type=OUTPUT, help="Draw the channel to this file.")
+@with_force
 def command(
     params: str,
     settings: tuple[str, ...],

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import write_json
+from agv_analysis.commands import OutputFile, with_force, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.doctor.examination import Examination
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @click.command("doctor")
 @click.option(
-    "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True),
+    "--json", "json_file", type=OutputFile(allow_dash=True),
     help="Write the facts to this file, too; - prints them as JSON instead.",
 )  # fmt: skip
 @click.option("--fix", is_flag=True, help="Remove shared memory that dead processes of this user left behind.")
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     "--seconds", type=click.FloatRange(0.0, 3600.0), default=3.0, show_default=True,
     help="For how long the loop is driven to see its jitter; 0: not at all.",
 )  # fmt: skip
+@with_force
 def command(json_file: Path | None, fix: bool, seconds: float) -> None:
     """Say what of this machine matters to the loop: versions, middleware, network, clocks, cores, leftovers, jitter.
 

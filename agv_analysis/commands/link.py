@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import corridor_settings, write_json
+from agv_analysis.commands import OUTPUT, corridor_settings, with_force, write_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -40,9 +40,10 @@ _LONG = 2**25
     "--rtt", type=click.Choice(["up", "half", "down"]), default="up", show_default=True,
     help="Where only round trips are known: on which way packets and time were lost.",
 )  # fmt: skip
-@click.option("--trace", type=click.Path(path_type=Path), help="Write a file for the channel trace, with times.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Draw the link to this file.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+@click.option("--trace", type=OUTPUT, help="Write a file for the channel trace, with times.")
+@click.option("--picture", type=OUTPUT, help="Draw the link to this file.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write the figures to this file, too.")
+@with_force
 def command(
     file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, name: str | None,
     interval: float | None, columns: tuple[str, ...], topic: str, received: Path | None, rtt: str, trace: Path | None,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from agv_analysis.commands import OUTPUT, with_force
 from agv_analysis.output_file import output_file
 
 
@@ -22,7 +23,8 @@ from agv_analysis.output_file import output_file
 )
 @click.option("--seconds", type=click.FloatRange(0.1, 864000.0), default=3600.0, help="With --listen: for how long.")
 @click.option("--size", type=click.IntRange(1, 1400), help="Bytes of a packet; that of a pose by default.")
-@click.option("--trace", type=click.Path(path_type=Path), default=Path("link.csv"), show_default=True, help="To where.")
+@click.option("--trace", type=OUTPUT, default=Path("link.csv"), show_default=True, help="To where.")
+@with_force
 def command(
     host: str | None, listen: bool, port: int, peer: str | None, params: str | None, interval: float | None,
     duration: float, seconds: float, size: int | None, trace: Path,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import needs_ros, write_json
+from agv_analysis.commands import OUTPUT, needs_ros, with_force, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
@@ -28,12 +28,13 @@ if TYPE_CHECKING:
 )
 @click.option("--again", is_flag=True, help="Repeat the run under the recorded outages; both runs in one table.")
 @click.option("--ros", is_flag=True, help="With --again: on DDS instead of simulated.")
-@click.option("--outages", type=click.Path(path_type=Path), help="Write the outcomes of the slots to this CSV file.")
+@click.option("--outages", type=OUTPUT, help="Write the outcomes of the slots to this CSV file.")
 @click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose outcomes.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the result to this file, too.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write the result to this file, too.")
 @click.option("--config", type=click.Path(path_type=Path), help="The params file to use instead of the bag's own.")
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter.")
 @click.option("--namespace", help="Which loop, for a bag of several.")
+@with_force
 def command(
     bag: Path, lockstep: bool, rate: float | None, edge: str, out: Path | None, compare: bool, again: bool, ros: bool,
     outages: Path | None, link: str, json_file: Path | None, config: Path | None, settings: tuple[str, ...],

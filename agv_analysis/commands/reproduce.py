@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from agv_analysis.commands import needs_ros
+from agv_analysis.commands import needs_ros, with_force
 
 if TYPE_CHECKING:
     from agv_analysis.reproduce.runs import Runs
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     help="Directory for figures, their data and the tables.",
 )  # fmt: skip
 @click.option("--ros", is_flag=True, help="Measure on recorded runs of the nodes instead of simulated ones.")
+@with_force
 def command(out: Path, ros: bool) -> None:
     """Reproduce the paper: its figures, every claim of its text with what was measured, and its future work.
 
@@ -29,6 +30,7 @@ def command(out: Path, ros: bool) -> None:
     """
     from rich.console import Console
 
+    from agv_analysis.output_file import is_forced, is_ours
     from agv_analysis.reproduce import dot_plot, report
     from agv_analysis.reproduce.claim import check
     from agv_analysis.reproduce.claims import CLAIMS
@@ -40,6 +42,8 @@ def command(out: Path, ros: bool) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{out}: cannot be made: {error.strerror}") from None
+    if any(out.iterdir()) and not is_forced() and not is_ours(out / report.CLAIMS_FILE):
+        raise UserError(f"{out}: is not empty and holds no earlier result: name another directory, or give --force")
     runs = _runs(out, ros)
     with Console(stderr=True).status("driving the paper's runs ..."):
         drawn = list(figures(runs))

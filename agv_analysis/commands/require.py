@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import corridor_settings, with_settings, write_json
-from agv_analysis.output_file import output_file
+from agv_analysis.commands import OUTPUT, corridor_settings, with_force, with_settings, write_json
+from agv_analysis.output_file import MARKDOWN_MARK, output_file
 
 if TYPE_CHECKING:
     from agv_analysis.requirements.link_availability import LinkAvailability
@@ -40,9 +40,10 @@ if TYPE_CHECKING:
 @click.option("--survival-time", type=click.FloatRange(min=0.0), help="Offered [s], by default that of the loop.")
 @click.option("--transfer-interval", type=click.FloatRange(min=0.0, min_open=True), help="Offered with it [s].")
 @click.option("--latency", type=click.FloatRange(min=0.0), help="Offered with it [s].")
-@click.option("--table", type=click.Path(path_type=Path), help="Write tables in Markdown to this file.")
-@click.option("--report", type=click.Path(path_type=Path), help="Write a page for the browser to this file.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
+@click.option("--table", type=OUTPUT, help="Write tables in Markdown to this file.")
+@click.option("--report", type=OUTPUT, help="Write a page for the browser to this file.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write the figures to this file, too.")
+@with_force
 def command(
     params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
     interval: float | None, name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
@@ -229,6 +230,6 @@ def _print(
 
 def _write(path: Path, text: str) -> None:
     try:
-        output_file(path).write_text(text, encoding="utf-8")
+        output_file(path).write_text(text + MARKDOWN_MARK, encoding="utf-8")
     except OSError as error:
         raise click.ClickException(f"{path}: cannot be written: {error.strerror}") from None

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import (
+    OUTPUT,
     corridor_json,
     corridor_settings,
     print_corridor,
     report_on,
     with_corridor,
+    with_force,
     with_report,
     with_settings,
     write_json,
@@ -31,9 +33,10 @@ if TYPE_CHECKING:
 @click.command("simulate")
 @with_settings
 @with_corridor
-@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Write the run to this file, a row a step.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+@click.option("--csv", "csv_file", type=OUTPUT, help="Write the run to this file, a row a step.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
 @with_report
+@with_force
 def command(
     params: str,
     settings: tuple[str, ...],

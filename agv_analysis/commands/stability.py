@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import corridor_settings, with_corridor, with_settings, write_json
+from agv_analysis.commands import OUTPUT, corridor_settings, with_corridor, with_force, with_settings, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.scenario import Scenario
@@ -34,7 +34,7 @@ _SEEDS = 20
     "--confidence", type=click.FloatRange(0.0, 1.0, min_open=True, max_open=True), metavar="C",
     help="Say, too, which corridor a lap keeps with the probability C, and up to which speed it keeps the --corridor.",
 )  # fmt: skip
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
 @click.option(
     "--map", "axes", metavar="AXIS,AXIS",
     help="Instead, to the files of --csv and --picture: margins over a grid of two of the control law's gains (kx, ky, "
@@ -43,11 +43,10 @@ _SEEDS = 20
     "prove.",
 )  # fmt: skip
 @click.option("--points", type=click.IntRange(2, 1000), default=100, show_default=True, help="Points of each axis.")
-@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="Where the map goes, map.csv by default.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Where the map is drawn, map.png by default.")
-@click.option(
-    "--report", type=click.Path(path_type=Path), help="With --map: write a page for the browser to this file."
-)
+@click.option("--csv", "csv_file", type=OUTPUT, help="Where the map goes, map.csv by default.")
+@click.option("--picture", type=OUTPUT, help="Where the map is drawn, map.png by default.")
+@click.option("--report", type=OUTPUT, help="With --map: write a page for the browser to this file.")
+@with_force
 def command(
     params: str,
     settings: tuple[str, ...],
@@ -80,6 +79,7 @@ def command(
 
     from agv_analysis.corridor.corridor import corridor
     from agv_analysis.corridor.kept_with_confidence import kept_with_confidence
+    from agv_analysis.output_file import output_file
     from agv_analysis.report.table import colour_of
     from agv_analysis.scenario import load_scenario
     from agv_analysis.stability.empirical import simulated_twins, too_short, with_an_end
@@ -91,7 +91,7 @@ def command(
 
     scenario = load_scenario(params, (*settings, *corridor_settings(corridor_width, corridor_along)))
     if axes is not None:
-        _map(scenario, axes, points, csv_file or Path("map.csv"), picture or Path("map.png"), report)
+        _map(scenario, axes, points, csv_file or output_file("map.csv"), picture or output_file("map.png"), report)
         return
     if report is not None:
         raise click.UsageError("--report is of a map: name its axes by --map; `simulate` reports on a run")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import corridor_settings, with_corridor, with_report, with_settings
+from agv_analysis.commands import corridor_settings, with_corridor, with_force, with_report, with_settings
 from agv_analysis.sweep import CORRIDOR_COLUMNS, METRICS, MOST_POINTS
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ _LONGEST_TABLE = 40
 @click.option("--workers", type=click.IntRange(1), help="Threads on this machine; one a core by default.")
 @click.option("--scheduler", metavar="ADDRESS", help="Run on the Dask cluster whose scheduler is there.")
 @with_report
+@with_force
 def command(
     params: str,
     settings: tuple[str, ...],

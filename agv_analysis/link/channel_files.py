@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.link.channel_study import ChannelStudy
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import output_file, save_figure
 from agv_ros.errors import UserError
 
 DRAWN = 1000
@@ -55,6 +55,6 @@ def draw(path: Path, found: ChannelStudy) -> None:
     shares.set(yscale="log", xlabel="n_ul [slots]", ylabel="share of slots", title="Age of information")
     shares.legend(loc="best", fontsize="small")
     try:
-        figure.savefig(output_file(path), dpi=130)
+        save_figure(figure, path, dpi=130)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn to: {error}") from None

@@ -10,7 +10,7 @@ import numpy as np
 from agv_analysis.link.large_arrays import is_all_nan, parts, sizes_and_counts, taken
 from agv_analysis.link.link_figures import LinkFigures
 from agv_analysis.link.measurement import LOST as LOST_PACKET
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import save_figure
 from agv_analysis.run import Floats
 from agv_ros.errors import UserError
 
@@ -62,7 +62,7 @@ def draw_link(path: Path, found: LinkFigures) -> None:
         delays.legend(loc="upper right", fontsize="small")
     delays.set(xlabel="delay [ms]", ylabel="share of packets at least as late", title="Delay")
     try:
-        figure.savefig(output_file(path), dpi=130)
+        save_figure(figure, path, dpi=130)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn to: {error}") from None
 

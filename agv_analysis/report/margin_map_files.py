@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from agv_analysis.corridor.corridor_map import TITLES
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import output_file, save_figure
 from agv_analysis.stability.margin_map import MarginMap, map_columns
 from agv_ros.errors import UserError
 
@@ -42,6 +42,6 @@ def draw(path: Path, found: MarginMap) -> None:
             scale("log" if values.min() > 0.0 and values.max() >= 10.0 * values.min() else "linear")
         figure.colorbar(mesh, ax=axes)
     try:
-        figure.savefig(output_file(path), dpi=150)
+        save_figure(figure, path, dpi=150)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn: {error}") from None

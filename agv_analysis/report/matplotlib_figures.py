@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import save_figure
 from agv_analysis.report.panels import (
     BARS,
     DEVIATIONS,
@@ -63,9 +63,9 @@ def draw_figures(panels: Iterable[Panel], folder: Path) -> list[Path]:
             with mpl.rc_context(STYLE):
                 figure = Figure(figsize=(WIDTH, WIDTH if panel.equal else 0.62 * WIDTH), layout="constrained")
                 draw_panel(figure.add_subplot(), panel)
-                for suffix, metadata in (("svg", {"Date": None}), ("pdf", {"CreationDate": None})):
+                for suffix in ("svg", "pdf"):
                     drawn.append(folder / f"{panel.key}.{suffix}")
-                    figure.savefig(output_file(drawn[-1]), metadata=metadata)
+                    save_figure(figure, drawn[-1])
     except OSError as error:
         raise UserError(f"{folder}: cannot be written to: {error.strerror or error}") from None
     return drawn

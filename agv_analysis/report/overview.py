@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import save_figure
 from agv_analysis.report.matplotlib_figures import draw_panel
 from agv_analysis.report.panels import age, distance, speed, track
 from agv_analysis.run import Run
@@ -35,6 +35,6 @@ def draw(run: Run, path: Path) -> None:
     from_above.set_title("Track")
     over_time[0].set_title("Error, speed, age of the pose")
     try:
-        figure.savefig(output_file(path), dpi=130)
+        save_figure(figure, path, dpi=130)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be drawn to: {error}") from None

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from agv_analysis.output_file import not_linked_out, save_figure
 from agv_analysis.reproduce.claim import Values
 from agv_analysis.reproduce.figures import STYLE, WIDTH
 from agv_analysis.reproduce.report import Table, text_of
@@ -32,8 +33,8 @@ def write(table: Table, folder: Path) -> None:
         _draw(canvas.add_subplot(), table)
         canvas.legend(loc="outside upper left", frameon=False)
         try:
-            canvas.savefig(folder / f"{table.key}.svg", metadata={"Date": None})
-            canvas.savefig(folder / f"{table.key}.png", dpi=300)
+            save_figure(canvas, folder / f"{table.key}.svg")
+            save_figure(canvas, folder / f"{table.key}.png", dpi=300)
             _write_csv(table.rows, folder / f"{table.key}.csv")
         except OSError as error:
             raise UserError(f"{folder / table.key}: cannot be written: {error.strerror}") from None
@@ -70,7 +71,7 @@ def _number(value: object) -> float | None:
 
 
 def _write_csv(rows: Sequence[Values], path: Path) -> None:
-    with open(path, "w", encoding="utf-8", newline="") as file:
+    with open(not_linked_out(path), "w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.output_file import not_linked_out, save_figure
 from agv_analysis.reproduce.runs import GAINS, LIMIT, Runs, gain
 from agv_analysis.run import Floats, Run
 from agv_ros.errors import UserError
@@ -95,8 +96,8 @@ def write(figure: Figure, folder: Path) -> None:
         if len(figure.curves) > 1:
             axes.legend()
         try:
-            canvas.savefig(folder / f"{figure.name}.svg", metadata={"Date": None, "Title": figure.where})
-            canvas.savefig(folder / f"{figure.name}.png", dpi=300, metadata={"Title": figure.where})
+            save_figure(canvas, folder / f"{figure.name}.svg", figure.where)
+            save_figure(canvas, folder / f"{figure.name}.png", figure.where, dpi=300)
             _write_csv(figure, folder / f"{figure.name}.csv")
         except OSError as error:
             raise UserError(f"{folder / figure.name}: cannot be written: {error.strerror}") from None
@@ -106,6 +107,6 @@ def _write_csv(figure: Figure, path: Path) -> None:
     """A pair of columns for each curve, in full precision."""
     names = [f"{label}: {axis}" for label in figure.curves for axis in (figure.x_label, figure.y_label)]
     columns = [values.tolist() for curve in figure.curves.values() for values in curve]
-    with open(path, "w", encoding="utf-8", newline="") as file:
+    with open(not_linked_out(path), "w", encoding="utf-8", newline="") as file:
         file.write(",".join(names) + "\n")
         file.writelines(",".join(map(repr, row)) + "\n" for row in zip(*columns, strict=True))

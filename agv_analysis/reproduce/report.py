@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from agv_analysis.output_file import JSON_MARK, MARKDOWN_MARK, not_linked_out
 from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding, Values
 from agv_analysis.version import version
 from agv_ros.errors import UserError
@@ -103,18 +104,26 @@ def _markdown(rows: Sequence[Values]) -> str:
     return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
 
 
+CLAIMS_FILE = "claims.json"
+"""By it a directory is known as one of this command's."""
+
+
 def write(findings: Sequence[Finding], tables: Sequence[Table], source: str, folder: Path) -> None:
     """Write claims.md, future.md and claims.json, which holds both, to `folder`.
 
     Raises UserError if that cannot be written to.
     """
     try:
-        (folder / "claims.md").write_text(claims_markdown(findings), encoding="utf-8")
-        (folder / "future.md").write_text("\n".join(map(table_markdown, tables)), encoding="utf-8")
-        text = json.dumps(to_json(findings, tables, source), indent=2, allow_nan=False)
-        (folder / "claims.json").write_text(text + "\n", encoding="utf-8")
+        _write(folder / "claims.md", claims_markdown(findings) + MARKDOWN_MARK)
+        _write(folder / "future.md", "\n".join(map(table_markdown, tables)) + MARKDOWN_MARK)
+        text = json.dumps({**JSON_MARK, **to_json(findings, tables, source)}, indent=2, allow_nan=False)
+        _write(folder / CLAIMS_FILE, text + "\n")
     except OSError as error:
         raise UserError(f"{folder}: cannot be written to: {error.strerror}") from None
+
+
+def _write(path: Path, text: str) -> None:
+    not_linked_out(path).write_text(text, encoding="utf-8")
 
 
 def to_json(findings: Sequence[Finding], tables: Sequence[Table], source: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import save_figure
 from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.plan import Axis, Sweep, SweepError
@@ -47,7 +47,7 @@ def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path) -> N
         figure.colorbar(_heat_map(axes, sweep, rows, metric), label=_title(metric))
     axes.set_title(f"{_title(metric)}, {max(row['runs'] for row in rows)} seeds a point", fontsize="medium")
     try:
-        figure.savefig(output_file(path), dpi=130)
+        save_figure(figure, path, dpi=130)
     except (OSError, ValueError) as error:
         raise SweepError(f"{path}: cannot be drawn to: {error}") from None
 

@@ -7,17 +7,18 @@ import importlib
 from pathlib import Path
 from typing import Any
 
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import not_linked_out
 from agv_analysis.sweep.plan import SweepError
 
 
 def write_rows(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write rows to a .csv or a .parquet file. Raises SweepError if that cannot be done."""
+    """Write rows to a .csv or a .parquet file in a directory of ours. Raises SweepError if that cannot be done."""
+    not_linked_out(path)
     try:
         if path.suffix == ".parquet":
             _write_parquet(rows, path)
         else:
-            with open(output_file(path), "w", encoding="utf-8", newline="") as file:
+            with open(path, "w", encoding="utf-8", newline="") as file:
                 writer = csv.DictWriter(file, list(rows[0]))
                 writer.writeheader()
                 writer.writerows(rows)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.output_file import output_file
+from agv_analysis.output_file import not_linked_out
 from agv_analysis.simulation import STATISTICS
 from agv_analysis.simulation.batch import Table
 from agv_analysis.sweep.plan import Part, Sweep, SweepError
@@ -37,7 +37,7 @@ class Store:
         """Keep a part; it is there as a whole or not at all."""
         path = self._path(part)
         unfinished = path.with_suffix(".tmp")
-        with open(output_file(unfinished), "wb") as file:
+        with open(not_linked_out(unfinished), "wb") as file:
             np.save(file, table)
         unfinished.replace(path)
 
@@ -81,7 +81,7 @@ def _make(folder: Path, parts: Path, about: Path, description: dict[str, Any]) -
         if any(folder.iterdir()):
             raise SweepError(f"{folder}: is not empty: name another directory, or go on with its sweep by --resume")
         parts.mkdir()
-        output_file(about).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
+        not_linked_out(about).write_text(json.dumps(description, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise SweepError(f"{folder}: cannot be written to: {error.strerror}") from None
 
