@@ -295,7 +295,8 @@ class PlantNode(LoopNode[PlantParameters]):
         question = (
             f"is the {silent} running?"
             if silent
-            else "all nodes are there: do they have the same ts and start_time, and does each hear the one before it?"
+            else "all nodes are known, but one that was killed still is for some 20 s: do all of them run, with the "
+            "same ts and start_time, and does each hear the one before it?"
         )
         return f"no answer to step {self.k} on agv/cmd_vel within {self.settings.answer_timeout:g} s: {question}"
 

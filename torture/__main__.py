@@ -14,7 +14,8 @@ from typing import Any
 import click
 
 from fuzz.campaign import run as fuzz
-from torture.kills import cases, faults, run
+from torture.by_hand import faults_by_hand, run_by_hand
+from torture.kills import Case, cases, faults, run
 from torture.wire import attack
 
 PARAMS = str(Path(__file__).parents[1] / "config/outages.yaml")
@@ -49,15 +50,25 @@ def _kills(seed: int, end: float, folder: Path) -> dict[str, Any]:
         if time.monotonic() > end:
             break
         with tempfile.TemporaryDirectory(dir=folder) as own:
-            ended = run(case, Path(own), PARAMS)
-            wrong = faults(case, ended, Path(own) / "bag")
+            wrong, seconds, said = _by_hand(case, Path(own)) if case.start == "hand" else _by_runner(case, Path(own))
         done += 1
         if case.number.name != "SIGSTOP":
-            longest = max(longest, ended.seconds)
+            longest = max(longest, seconds)
         if wrong:
-            bad[str(case)] = [*wrong, ended.said.strip().rpartition("\n")[2]]
+            bad[str(case)] = [*wrong, said.strip().rpartition("\n")[2]]
             click.echo(f"{case}: {'; '.join(bad[str(case)])}")
     return {"cases": done, "of": len(order), "bad": len(bad), "longest_s": round(longest, 2), "faults": bad}
+
+
+def _by_runner(case: Case, folder: Path) -> tuple[list[str], float, str]:
+    """Faults, seconds to the end, and what was said."""
+    ended = run(case, folder, PARAMS)
+    return faults(case, ended, folder / "bag"), ended.seconds, ended.said
+
+
+def _by_hand(case: Case, folder: Path) -> tuple[list[str], float, str]:
+    ended = run_by_hand(case, folder, PARAMS)
+    return faults_by_hand(case, ended, folder / "bag"), max(ended.victim_seconds, ended.seconds), ended.said["plant"]
 
 
 def _wire(seed: int, end: float, folder: Path) -> dict[str, Any]:

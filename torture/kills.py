@@ -21,7 +21,9 @@ from agv_ros.errors import UserError
 NODES = ("runner", "recorder", "controller", "error_detector", "relay", "plant")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGSTOP)
 CLOCKS = ("lockstep", "realtime")
-MOMENTS = ("start", "running", "end")
+MOMENTS = ("start", "running", "outage", "end")
+STARTS = ("runner", "hand")
+"""Who starts the nodes: `agv-ncs run --processes`, or a person one by one."""
 
 IN_TIME = 5.0
 """How long [s] a run may take to end after the signal, on a machine that is not busy."""
@@ -32,12 +34,15 @@ MOST_LOST = {"lockstep": 1000, "realtime": 40 + 20}
 HALT = 2.0
 """How long [s] SIGSTOP halts a process."""
 
-_STEPS = {"lockstep": 6000, "realtime": 800}
-_TS = 0.005
+STEPS = {"lockstep": 6000, "realtime": 800}
+TS = 0.005
 _BYTES_A_STEP = 100
 """Fewest that a step adds to the recording."""
 
-_PATIENCE = 90.0
+SHARE = {"start": None, "running": 0.3 * _BYTES_A_STEP, "outage": 0.5 * _BYTES_A_STEP, "end": 0.9 * _BYTES_A_STEP}
+"""Bytes of the recording for each step of the run after which a moment has come; None: as soon as the node is there."""
+
+PATIENCE = 90.0
 """How long [s] anything may take before it counts as hanging."""
 
 
@@ -48,9 +53,11 @@ class Case(NamedTuple):
     number: signal.Signals
     clock: str
     moment: str
+    start: str = "runner"
 
     def __str__(self) -> str:
-        return f"{self.number.name} to the {self.node}, {self.clock}, {self.moment}"
+        by_hand = ", by hand" if self.start == "hand" else ""
+        return f"{self.number.name} to the {self.node}, {self.clock}, {self.moment}{by_hand}"
 
 
 class Ended(NamedTuple):
@@ -68,35 +75,45 @@ class Ended(NamedTuple):
 
 def cases() -> Iterator[Case]:
     """All combinations."""
-    for clock, moment, node, number in itertools.product(CLOCKS, MOMENTS, NODES, SIGNALS):
-        yield Case(node, number, clock, moment)
+    for start, clock, moment, node, number in itertools.product(STARTS, CLOCKS, MOMENTS, NODES, SIGNALS):
+        if (start, node) != ("hand", "runner"):
+            yield Case(node, number, clock, moment, start)
+
+
+def outage_settings(case: Case) -> dict[str, str]:
+    """Parameters of the relay: for the moment in an outage one that begins after 0.2 s and does not end."""
+    return {"uplink.schedule": "0.2: outage=1000"} if case.moment == "outage" else {}
 
 
 def run(case: Case, folder: Path, params: str) -> Ended:
     """Start a run of the params file in processes, recorded to `folder`/bag, send the signal, and wait for its end."""
-    steps = _STEPS[case.clock]
+    steps = STEPS[case.clock]
     command = [sys.executable, "-m", "agv_analysis.cli", "run", params, "--processes", "--clock", case.clock]
-    command += ["--duration", str(steps * _TS), "--bag", str(folder / "bag")]
+    command += ["--duration", str(steps * TS), "--bag", str(folder / "bag")]
+    for name, value in outage_settings(case).items():
+        command += ["--set", f"relay.{name}={value}"]
     runner = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     family, held = {}, []
     try:
-        _until(runner, lambda: len(_children(runner.pid)) == len(NODES) - 1)
+        until(runner, lambda: len(_children(runner.pid)) == len(NODES) - 1)
         family = _children(runner.pid)
-        share = {"start": None, "running": 0.3, "end": 0.9}[case.moment]
+        share = SHARE[case.moment]
         if share is not None:
-            _until(runner, lambda: _recorded(folder / "bag") > share * steps * _BYTES_A_STEP)
-        victim = runner.pid if case.node == "runner" else family[case.node]
-        held = held_by(victim)
+            until(runner, lambda: recorded_bytes(folder / "bag") > share * steps)
+        victim = runner.pid if case.node == "runner" else family.get(case.node)
+        held = [] if victim is None else held_by(victim)
         with contextlib.suppress(ProcessLookupError):
+            if victim is None:
+                raise ProcessLookupError(case.node)  # the run has ended before: what it said is judged below
             os.kill(victim, case.number)
             if case.number == signal.SIGSTOP:
                 time.sleep(HALT)
                 os.kill(victim, signal.SIGCONT)
         begun = time.monotonic()
-        said, _ = runner.communicate(timeout=_PATIENCE)
-        _until(None, lambda: not any(map(_runs, family.values())), 4.0)
+        said, _ = runner.communicate(timeout=PATIENCE)
+        until(None, lambda: not any(map(_runs, family.values())), 4.0)
         seconds = time.monotonic() - begun
         left = {one.path for one in leftovers(settled=0.0)}.intersection(held)
         orphans = tuple(n for n, pid in family.items() if _runs(pid))
@@ -119,11 +136,16 @@ def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
         found.append(f"ended after {ended.seconds:.1f} s")
     if "Traceback" in ended.said:
         found.append("said a traceback")
-    found += _wrong_status(case, ended)
+    return found + _wrong_status(case, ended) + lost_steps(case, ended.said, bag)
+
+
+def lost_steps(case: Case, said: str, bag: Path) -> list[str]:
+    """What is missing from the recording and should not be, by what the nodes said; empty if nothing is."""
+    found = []
     recorded, missing = _in_bag(bag)
     if recorded is None and case.moment != "start":
         found.append("left a bag that cannot be read")
-    reached = re.search(r"after step (\d+)", ended.said)
+    reached = re.search(r"after step (\d+)", said)
     if reached and recorded is not None and recorded < int(reached[1]) - MOST_LOST[case.clock]:
         found.append(f"left {recorded} of {reached[1]} steps in the bag")
     if case.clock == "lockstep" and case.number != signal.SIGKILL and missing:
@@ -133,7 +155,7 @@ def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
 
 def _wrong_status(case: Case, ended: Ended) -> list[str]:
     """Is the exit status such as the signal asks for, and is the process named that it went to?"""
-    is_complete = f"{_STEPS[case.clock]} steps" in ended.said and "Error" not in ended.said
+    is_complete = f"{STEPS[case.clock]} steps" in ended.said and "Error" not in ended.said
     if case.node == "runner" and case.number == signal.SIGKILL:
         return [] if ended.status == -signal.SIGKILL or is_complete else [f"exit status {ended.status}"]
     if ended.status == 0:
@@ -152,7 +174,8 @@ def _in_bag(bag: Path) -> tuple[int | None, dict[str, int]]:
     return int(found.k[-1]) + 1, dict(found.unexplained)
 
 
-def _until(process: subprocess.Popen[str] | None, condition: Callable[[], bool], seconds: float = _PATIENCE) -> None:
+def until(process: subprocess.Popen[str] | None, condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
+    """Wait for a condition, for so long at most, or until the process has ended."""
     deadline = time.monotonic() + seconds
     while not condition() and time.monotonic() < deadline and (process is None or process.poll() is None):
         time.sleep(0.01)
@@ -178,7 +201,8 @@ def _runs(pid: int) -> bool:
     return False
 
 
-def _recorded(bag: Path) -> int:
+def recorded_bytes(bag: Path) -> int:
+    """Size of what has been recorded so far."""
     with contextlib.suppress(OSError):
         return sum(file.stat().st_size for file in bag.glob("*.mcap"))
     return 0

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
 
+from torture.by_hand import faults_by_hand, run_by_hand
 from torture.kills import Case, faults, run
 
 CONFIG = str(Path(__file__).parents[2] / "config/outages.yaml")
@@ -18,7 +19,7 @@ CONFIG = str(Path(__file__).parents[2] / "config/outages.yaml")
     "case",
     [
         Case("plant", signal.SIGTERM, "lockstep", "running"),
-        Case("relay", signal.SIGKILL, "realtime", "running"),
+        Case("relay", signal.SIGKILL, "realtime", "outage"),
         Case("recorder", signal.SIGKILL, "lockstep", "running"),
         Case("runner", signal.SIGKILL, "lockstep", "running"),
     ],
@@ -28,3 +29,16 @@ def test_a_run_ends_as_it_should_whatever_process_gets_a_signal(tmp_path: Path, 
     ended = run(case, tmp_path, CONFIG)
     # How fast it ends is a matter of the machine, too: `make torture` looks at that.
     assert faults(case, ended._replace(seconds=0.0), tmp_path / "bag") == [], ended.said
+
+
+def test_nodes_by_hand_end_as_they_should_when_one_of_them_gets_a_signal(tmp_path: Path) -> None:
+    case = Case("controller", signal.SIGTERM, "realtime", "outage", "hand")
+    ended = run_by_hand(case, tmp_path, CONFIG)
+    assert ended.statuses == dict.fromkeys(("recorder", "controller", "error_detector", "relay", "plant"), 0)
+    on_time = ended._replace(seconds=0.0, victim_seconds=0.0)
+    assert faults_by_hand(case, on_time, tmp_path / "bag") == [], ended.said
+    # That the comparison sees them: a plant that says nothing, a node that does not end, one that ends by itself.
+    mute = on_time._replace(said=dict.fromkeys(ended.said, ""), orphans=("relay",), early=("recorder",))
+    assert set(faults_by_hand(case, mute, tmp_path / "bag")) == {
+        "the plant ends with 0 and has not done its steps", "relay does not end", "recorder ended by itself",
+    }  # fmt: skip
