@@ -13,7 +13,7 @@ import click
 
 COMMANDS = (
     "run", "analyse", "stability", "channel", "link", "probe", "require", "parameters", "simulate", "explore", "sweep",
-    "bag", "replay", "reproduce", "node", "doctor", "watch",
+    "bag", "replay", "reproduce", "node", "doctor", "watch", "identify",
 )  # fmt: skip
 
 

@@ -32,7 +32,7 @@ from agv_ros.errors import UserError
 from agv_ros.parameters import as_dict
 from agv_ros.stamps import NS_PER_S, to_nanoseconds
 
-__all__ = ["RobotTopics", "read_robot_run"]
+__all__ = ["RobotTopics", "read_robot_poses", "read_robot_run"]
 
 
 def read_robot_run(
@@ -50,6 +50,13 @@ def read_robot_run(
         raise UserError(f"two references, the topic {topics.reference} and the file {track_file}: name one of them")
     if topics.reference is None and track_file is None and config is None:
         raise UserError("no reference: name its topic with --reference-topic, or a track with --track-file or --config")
+    bag, poses = read_robot_poses(path, topics, pose_frames)
+    target = None if topics.reference is None else read_reference(bag, topics.reference, poses)
+    return _run(bag, topics, poses, target, _scenario(track_file, config), config)
+
+
+def read_robot_poses(path: Path, topics: RobotTopics, pose_frames: tuple[str, str] | None = None) -> tuple[Bag, Track]:
+    """A robot's recording with the messages of `topics`, and its poses. Raises UserError, as `read_robot_run`."""
     named = [name for name in topics if name is not None]
     bag = read_bag(path, topics=named)
     if topics.pose in bag.topics and bag.topics[topics.pose].type == TRANSFORMS:
@@ -59,8 +66,7 @@ def read_robot_run(
         poses = read_transforms(bag, topics.pose, *pose_frames)
     else:
         poses = read_poses(bag, topics.pose)
-    target = None if topics.reference is None else read_reference(bag, topics.reference, poses)
-    return _run(bag, topics, poses, target, _scenario(track_file, config), config)
+    return bag, poses
 
 
 def _scenario(track_file: Path | None, config: Path | None) -> Scenario:

@@ -33,6 +33,21 @@ def read_commands(
     command = np.full((len(stamps), 2), np.nan)
     if topic is None:
         return command, ("no command: the damping of the speed is not computed",)
+    instants, speeds, notes = sent_commands(bag, topic, came, wheelbase)
+    ends = np.append(stamps[1:], stamps[-1] + round(period))
+    newest = np.searchsorted(instants, ends, side="left") - 1
+    known = newest >= 0
+    command[known] = speeds[newest[known]]
+    if held := int(np.count_nonzero(np.diff(newest[known]) == 0)):
+        notes = (*notes, f"{topic}: no command came in {held} of {len(stamps)} steps, the last one is held")
+    return command, notes
+
+
+def sent_commands(bag: Bag, topic: str, came: Track, wheelbase: float | None) -> tuple[Steps, Floats, tuple[str, ...]]:
+    """Instants [ns] of all commands by the clock of the poses' stamps, in order, shape (M,); and notes on them.
+
+    Beside them the commands (v, w) [m/s, rad/s], shape (M, 2). `wheelbase` and errors as of `read_commands`.
+    """
     messages = messages_of(bag, topic, tuple(COMMANDS), "command")
     prefix = COMMANDS[bag.topics[topic].type]
     instants, notes = stamps_of(messages) if prefix else np.zeros(len(messages), dtype=np.int64), []
@@ -50,14 +65,8 @@ def read_commands(
         )
         instants = by_the_clock_of(came, messages[LOG_TIME])
     order = np.argsort(instants, kind="stable")
-    ends = np.append(stamps[1:], stamps[-1] + round(period))
-    newest = np.searchsorted(instants[order], ends, side="left") - 1
-    known = newest >= 0
-    for column, speeds in enumerate(_speeds(messages, prefix, f"{bag.path}: {topic}", wheelbase)):
-        command[known, column] = speeds[order][newest[known]]
-    if held := int(np.count_nonzero(np.diff(newest[known]) == 0)):
-        notes.append(f"{topic}: no command came in {held} of {len(stamps)} steps, the last one is held")
-    return command, tuple(notes)
+    speeds = np.column_stack(_speeds(messages, prefix, f"{bag.path}: {topic}", wheelbase))
+    return instants[order], speeds[order].astype(np.float64), tuple(notes)
 
 
 def _speeds(messages: NDArray[np.void], prefix: str, where: str, wheelbase: float | None) -> tuple[Floats, Floats]:
