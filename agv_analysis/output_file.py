@@ -1,21 +1,20 @@
 """Files that commands write: never through a link that leads elsewhere, never in place of what another program wrote.
 
 Each output carries a mark of its origin: a key in JSON, a `generator` in HTML, metadata in PNG, SVG and PDF, a comment
-in Markdown, the names of its columns in CSV. A file that is there is replaced if it carries one, or with --force.
+in Markdown and YAML, the names of its columns in CSV. A file that is there is replaced if it carries one, or with
+--force.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import click
 
 from agv_ros.errors import UserError
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 ORIGIN = "agv_ncs"
 
@@ -24,6 +23,9 @@ JSON_MARK = {"written_by": ORIGIN}
 
 MARKDOWN_MARK = f"<!-- written by {ORIGIN} -->\n"
 """Last line of each Markdown file."""
+
+YAML_MARK = f"# written by {ORIGIN}\n"
+"""First line of each YAML file."""
 
 FORCE = "agv_analysis.force"
 """Key of --force in the context of click."""
@@ -46,6 +48,7 @@ _COLUMNS = (
 _OURS = re.compile(
     rb"\s*\{\s*\"written_by\": *\"agv_ncs\""
     rb"|<!DOCTYPE html>.{,1000}?<meta name=\"generator\" content=\"agv_ncs\">"
+    rb"|# written by agv_ncs\r?\n"
     rb"|\x89PNG.{,4000}?tEXtSoftware\0agv_ncs"
     rb"|<\?xml.{,4000}?<dc:creator>\s*<cc:Agent>\s*<dc:title>agv_ncs</dc:title>"
     rb"|%PDF.*/Creator \(agv_ncs\)"
@@ -56,6 +59,14 @@ _OURS = re.compile(
 
 _END = 1 << 16
 """So many bytes at each end of a file are searched for a mark."""
+
+
+class Figure(Protocol):
+    """What draws itself to a file: matplotlib's."""
+
+    @property
+    def savefig(self) -> Callable[..., Any]:
+        """Draw to a path."""
 
 
 def not_linked_out(path: Path | str) -> Path:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import write_json
+from agv_analysis.commands import OUTPUT, with_force, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.identify.bearable_gains import BearableGains
@@ -26,10 +26,11 @@ if TYPE_CHECKING:
     help="Of a car that is commanded by its steering angle [m].",
 )  # fmt: skip
 @click.option(
-    "--params", "params_file", type=click.Path(path_type=Path),
+    "--params", "params_file", type=OUTPUT,
     help="Write the params file of a plant that behaves like this robot, for `agv-ncs stability` and the others.",
 )  # fmt: skip
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write what is printed to this file, too.")
+@click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
+@with_force
 def command(
     bag: Path, pose_topic: str | None, pose_frames: tuple[str, str] | None, command_topic: str | None,
     topics: Path | None, wheelbase: float | None, params_file: Path | None, json_file: Path | None,
@@ -48,7 +49,7 @@ def command(
 
     from agv_analysis.identify.bearable_gains import bearable_gains, robot_scenario
     from agv_analysis.identify.robot import identify_recording
-    from agv_analysis.output_file import output_file
+    from agv_analysis.output_file import YAML_MARK, output_file
     from agv_analysis.recordings.robot_topics import read_topics
     from agv_ros.errors import UserError
 
@@ -70,7 +71,7 @@ def command(
     if gains is None or (scenario := robot_scenario(robot, gains)) is None:
         raise UserError(f"{params_file} is not written: it needs dead time, lag and gain of both v and w")
     try:
-        output_file(params_file).write_text(scenario.to_yaml(), encoding="utf-8")
+        output_file(params_file).write_text(YAML_MARK + scenario.to_yaml(), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{params_file}: cannot be written: {error.strerror}") from None
     click.echo(f"params: {params_file}")

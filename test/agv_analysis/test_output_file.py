@@ -98,6 +98,7 @@ def test_a_command_replaces_what_it_wrote_and_keeps_what_others_wrote(
         ("table.csv", b"k,lost,why\n0,1,rain\n"),
         ("ping.csv", b"time,seq,rtt\n"),
         ("notes.md", b"written by agv_ncs\n"),
+        ("notes.yaml", b"plant: {}  # written by agv_ncs\n"),
         ("binary", bytes(range(256)) * 1000),
     ],
 )
@@ -116,15 +117,17 @@ def test_columns_that_a_trace_begins_with_are_known(tmp_path: Path) -> None:
     assert not is_ours(tmp_path / "none.csv")
 
 
+WRITTEN = ("json_file", "csv_file", "picture", "report", "trace", "table", "outages", "params_file")
+
+
 def test_each_command_that_writes_a_file_has_force() -> None:
     groups = [importlib.import_module(f"agv_analysis.commands.{name}").command for name in COMMANDS]
     commands = [one for group in groups for one in getattr(group, "commands", {"": group}).values()]
     writing = [one for one in commands if any(isinstance(param.type, OutputFile) for param in one.params)]
-    assert len(writing) == 12
+    assert len(writing) == 13
     for one in commands:
         for param in one.params:
-            is_written = param.name in ("json_file", "csv_file", "picture", "report", "trace", "table", "outages")
-            assert not is_written or isinstance(param.type, (OutputFile, click.types.BoolParamType))
+            assert param.name not in WRITTEN or isinstance(param.type, (OutputFile, click.types.BoolParamType))
         assert one not in writing or any("--force" in param.opts for param in one.params), one.name
 
 
