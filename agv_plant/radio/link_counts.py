@@ -32,10 +32,13 @@ class LinkCounts:
         self.expired += outcome.cause == EXPIRED
         self.delayed += is_late
         self._run = self._run + 1 if outcome.lost else 0
-        self.longest = max(self.longest, self._run)
+        if self._run > self.longest:
+            self.longest = self._run
 
     def note(self, outcome: SlotOutcome, *more: str) -> str:
         """Why a message that has just been counted was lost, and more about it: words `name=value`."""
+        if not (outcome.lost or more) and outcome.state == GOOD and math.isnan(outcome.gain):
+            return ""  # most of them, and the loop waits for each
         facts = [f"cause={outcome.cause}", f"run={self._run}"] if outcome.lost else []
         facts += more
         facts += [f"state={outcome.state}"] if outcome.state != GOOD else []
