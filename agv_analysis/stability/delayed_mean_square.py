@@ -94,17 +94,26 @@ def _drive_lap(F: Floats, G: Floats, moves: Floats, steps: int, moments: Floats)
                 for t in range(modes):
                     if moves[s, arrival, t] > 0.0:
                         _add_moved(F[row], G[row], answered, source, moments[s], moved, moves[s, arrival, t], after[t])
-        largest = 0.0
-        for t in range(modes):
-            for i in range(size):
-                for j in range(i + 1):
-                    moments[t, i, j] = after[t, i, j]
-                    moments[t, j, i] = after[t, i, j]
-                    largest = max(largest, abs(after[t, i, j]))
-        if largest > 1e100 or 0.0 < largest < 1e-100:
-            moments /= largest
-            log_scale += math.log(largest)
+        log_scale += _take_over(after, moments)
     return log_scale
+
+
+def _take_over(after: Floats, moments: Floats) -> float:
+    """Make `after`, of which the lower triangles are known, the moments, shapes (S, n, n).
+
+    They are scaled where they would leave the range of floats; returns the logarithm of what they were divided by.
+    """
+    largest = 0.0
+    for t in range(moments.shape[0]):
+        for i in range(moments.shape[1]):
+            for j in range(i + 1):
+                moments[t, i, j] = after[t, i, j]
+                moments[t, j, i] = after[t, i, j]
+                largest = max(largest, abs(after[t, i, j]))
+    if largest > 1e100 or 0.0 < largest < 1e-100:
+        moments /= largest
+        return math.log(largest)
+    return 0.0
 
 
 def _drive_predicted_lap(
@@ -137,16 +146,7 @@ def _drive_predicted_lap(
                         for i in range(size):
                             for j in range(i + 1):
                                 after[t, i, j] += weight * moved[i, j]
-        largest = 0.0
-        for t in range(modes):
-            for i in range(size):
-                for j in range(i + 1):
-                    moments[t, i, j] = after[t, i, j]
-                    moments[t, j, i] = after[t, i, j]
-                    largest = max(largest, abs(after[t, i, j]))
-        if largest > 1e100 or 0.0 < largest < 1e-100:
-            moments /= largest
-            log_scale += math.log(largest)
+        log_scale += _take_over(after, moments)
     return log_scale
 
 
