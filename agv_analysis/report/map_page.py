@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.corridor.corridor_map import N_ANY, P_HOUR, TITLES
+from agv_analysis.report.heat_map import colour_scale, heat_map_layout
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import plain
 from agv_analysis.report.sweep_table import number
@@ -113,19 +114,15 @@ def _heat_map(found: MarginMap, name: str, words: tuple[str, str]) -> dict[str, 
     x, y = found.second.tolist(), found.first.tolist()
     heat: dict[str, Any] = {"type": "heatmap", "x": x, "y": y, "colorbar": {"thickness": 14}}
     if name == P_HOUR:
-        scale = [[place, colour] for place, colour in zip((0.0, 0.5, 1.0), INSTABILITY_COLOURS, strict=True)]
+        scale = colour_scale(INSTABILITY_COLOURS)
         heat |= {"z": [plain(row) for row in values], "zmin": 0.0, "zmax": 1.0, "colorscale": scale}
     else:
         heat |= _by_size(values)
     heat["text"] = [[_said(name, value) for value in row] for row in values.tolist()]
     heat["hovertemplate"] = f"{words[0]}: %{{x:.4g}}<br>{words[1]}: %{{y:.4g}}<br>%{{text}}<extra></extra>"
-    layout: dict[str, Any] = {
-        "xaxis": {"title": {"text": words[0]}, **_scale(found.second)},
-        "yaxis": {"title": {"text": words[1]}, **_scale(found.first)},
-        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 60, "r": 12, "t": 32, "b": 44}, "modebar": {"bgcolor": "rgba(0,0,0,0)"},
-        "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
-    }  # fmt: skip
+    layout = heat_map_layout(*words)
+    layout["xaxis"] |= _scale(found.second)
+    layout["yaxis"] |= _scale(found.first)
     return {"data": [heat, *_borders(found, x, y)], "layout": layout}
 
 
@@ -133,7 +130,7 @@ def _by_size(values: Floats) -> dict[str, Any]:
     """Colours by the logarithm of a number of slots, green where many are survived."""
     size = np.log10(values + 2.0)
     top = max(1.0, float(size.max()))
-    scale = [[place, c] for place, c in zip((0.0, 0.5, 1.0), reversed(INSTABILITY_COLOURS), strict=True)]
+    scale = colour_scale(INSTABILITY_COLOURS[::-1])
     ticks = [tick for tick in _TICKS if np.log10(tick + 2.0) <= top]
     named = {"tickvals": np.log10(np.array(ticks) + 2.0).tolist(), "ticktext": [_tick(tick) for tick in ticks]}
     return {

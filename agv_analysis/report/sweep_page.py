@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.report.heat_map import colour_scale, heat_map_layout
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, distance, plain, thinned
 from agv_analysis.report.plotly import figure, packed_values
@@ -173,20 +174,14 @@ def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
     words = axis_words(across, sweep.base), axis_words(up, sweep.base)
     heat = {
         "type": "heatmap", "x": x_values, "y": y_values, "zmin": 0.0, "zmax": 1.0,
-        "colorscale": [[place, colour] for place, colour in zip((0.0, 0.5, 1.0), INSTABILITY_COLOURS, strict=True)],
+        "colorscale": colour_scale(INSTABILITY_COLOURS),
         "z": [[_plain(cell.get("instability")) for cell in line] for line in cells],
         "text": [[cell.get("verdict", "") for cell in line] for line in cells],
         "hovertemplate": f"{words[0]}: %{{x}}<br>{words[1]}: %{{y}}<br>probability of instability: %{{z}}<br>%{{text}}"
         "<extra></extra>",
         "colorbar": {"title": {"text": "probability of instability", "side": "right"}, "thickness": 14},
     }  # fmt: skip
-    layout = {
-        "xaxis": {"title": {"text": words[0]}}, "yaxis": {"title": {"text": words[1]}},
-        "paper_bgcolor": "rgba(0,0,0,0)", "plot_bgcolor": "rgba(0,0,0,0)",
-        "margin": {"l": 60, "r": 12, "t": 32, "b": 44}, "modebar": {"bgcolor": "rgba(0,0,0,0)"},
-        "legend": {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
-    }  # fmt: skip
-    return {"data": [heat, *_borders(sweep, across, up)], "layout": layout}
+    return {"data": [heat, *_borders(sweep, across, up)], "layout": heat_map_layout(*words)}
 
 
 def _borders(sweep: Sweep, across: Axis, up: Axis) -> Iterator[dict[str, Any]]:
