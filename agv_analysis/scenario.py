@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from agv_analysis.version import version
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_cloud.parameters import ControllerParameters, ErrorDetectorParameters
 from agv_cloud.staleness.registry import STALENESS_POLICIES
@@ -104,6 +105,11 @@ class Scenario:
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
+def metadata_of(scenario: Scenario) -> dict[str, str]:
+    """What a recording holds of its run, in the record METADATA_NAME of `bags.writer`: version, seed and parameters."""
+    return {"version": version(), "seed": str(scenario.relay.seed), "params": scenario.to_yaml()}
 
 
 def load_scenario(path: str | Path, settings: Iterable[str] = ()) -> Scenario:

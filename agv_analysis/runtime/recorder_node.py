@@ -25,7 +25,7 @@ from agv_analysis.bags.rosbag2_metadata import TopicInfo
 from agv_analysis.bags.writer import NODES_NAME, RESTART, BagWriter
 from agv_analysis.runtime.parameter_client_node import ParameterClient
 from agv_analysis.runtime.parameters import RecorderParameters
-from agv_analysis.scenario import load_scenario
+from agv_analysis.scenario import load_scenario, metadata_of
 from agv_analysis.version import version
 from agv_ros.codec import stamp_of
 from agv_ros.executor import run_node
@@ -343,10 +343,7 @@ _LATE = ": it began after the loop did; start the recorder first, or set wait_fo
 
 def _about(params_file: str) -> dict[str, str]:
     """What is embedded in the bag: version, and the run's parameters and seed if they are known. Raises UserError."""
-    if not params_file:
-        return {"version": version()}
-    scenario = load_scenario(params_file)
-    return {"version": version(), "seed": str(scenario.relay.seed), "params": scenario.to_yaml()}
+    return metadata_of(load_scenario(params_file)) if params_file else {"version": version()}
 
 
 def _qos(profile: QoSProfile) -> dict[str, Any]:

@@ -6,17 +6,13 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-import yaml
-
 from agv_analysis.bags.message_definitions import schema_of
 from agv_analysis.bags.rosbag2_metadata import TopicInfo
 from agv_analysis.bags.writer import NODES_NAME, BagWriter
-from agv_analysis.scenario import Scenario
-from agv_analysis.version import version
+from agv_analysis.scenario import Scenario, metadata_of
 from agv_analysis.watch.live_loop import DIAGNOSTICS, TOPICS
 from agv_analysis.watch.message_log import MessageLog
 from agv_ros.codec import stamp_of
-from agv_ros.ros_yaml import dump
 
 _OF_EVERY_STEP = ("edge/slot", "agv/pose", "edge/error", "edge/cmd_vel")
 
@@ -31,8 +27,7 @@ def save_bag(
     of its nodes. Raises UserError if the directory exists or cannot be made, OSError if it cannot be written to.
     """
     known = [TopicInfo(name, kind, schema_of(kind), "", []) for name, kind in zip(names, types, strict=True)]
-    params = scenario.to_yaml()
-    about = {"version": version(), "seed": str(scenario.relay.seed), "params": params}
+    about = metadata_of(scenario)
     by_stamp = scenario.plant.clock == "lockstep"
     writer = BagWriter(directory, [partial(known.__getitem__, i) for i in range(len(known))], about, by_stamp)
     try:
@@ -42,7 +37,7 @@ def save_bag(
             if topic != DIAGNOSTICS and not first_ns <= stamp_ns <= last_ns:
                 continue
             writer.write(topic, data, stamp_ns if by_stamp else received_ns, stamp_ns)
-        writer.add_metadata(NODES_NAME, {"params": dump(_sections(scenario)), **nodes})
+        writer.add_metadata(NODES_NAME, {"params": about["params"], **nodes})
         writer.close()
     except OSError:
         writer.abandon()
@@ -62,8 +57,3 @@ def _of_all_topics(log: MessageLog) -> tuple[int, int]:
     if not heard:
         return 0, 2**63 - 1
     return max(map(min, heard.values())), min(map(max, heard.values()))
-
-
-def _sections(scenario: Scenario) -> dict[str, dict[str, dict[str, object]]]:
-    found: dict[str, dict[str, dict[str, object]]] = yaml.safe_load(scenario.to_yaml())
-    return found
