@@ -28,12 +28,11 @@ from agv_cloud.step import EdgeStep
 from agv_cloud.timer_stepping import OutsideRunError, TimerStepping
 from agv_ros.codec import (
     decode_command,
-    decode_odometry,
-    decode_pose,
     decode_slot,
     encode_error,
     encode_pose,
     encode_slot,
+    pose_decoder,
     stamp_of,
 )
 from agv_ros.executor import run_node
@@ -72,7 +71,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._slots = SlotStepping(self.grid, settings.window_steps)
         self._timed = TimerStepping(self.grid, from_first_pose=settings.begin == "first_pose")
         self._is_timed = settings.trigger == TIMER
-        self._is_odometry = settings.pose_type == ODOMETRY
+        self._decode_pose = pose_decoder(settings.pose_type)
         self._timer: Any = None
         self._hears_paths = False
         self._refusal = ""
@@ -94,7 +93,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             self.input(TwistStamped, "edge/cmd_vel", self._on_command)
 
     def _make_inputs(self) -> None:
-        kind = Odometry if self._is_odometry else PoseStamped
+        kind = Odometry if self.settings.pose_type == ODOMETRY else PoseStamped
         feeds = [output for output in (self._error_out, self._reference_out) if output is not None]
         if self._is_timed:
             self._age_out = self.output(TimeReference, "edge/age", side=True)
@@ -121,9 +120,6 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             pose.pose.orientation.z, pose.pose.orientation.w = quaternion_of_yaw(point.theta)
             path.poses.append(pose)
         self._path_out.publish(path)
-
-    def _decode_pose(self, data: bytes) -> StampedPose:
-        return decode_odometry(data) if self._is_odometry else decode_pose(data)
 
     # -- along paths -------------------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from agv_plant.channels.timed_trace import read_trace
 from agv_plant.emulator_parameters import DirectionParameters, LinkEmulatorParameters
 from agv_plant.radio.channel import Channel
 from agv_plant.radio.message_link import Fate, MessageLink, UnderWay
-from agv_ros.codec import decode_odometry, decode_pose, encode_slot
+from agv_ros.codec import encode_slot, pose_decoder
 from agv_ros.endpoints import Offer, Output, message_class, offer_of
 from agv_ros.errors import UserError
 from agv_ros.executor import run_node
@@ -115,7 +115,7 @@ class LinkEmulatorNode(LoopNode[LinkEmulatorParameters]):
             topic.look()
 
     def _on_pose(self, data: bytes) -> None:
-        self.place = (decode_odometry(data) if self.settings.pose_type == ODOMETRY else decode_pose(data))[1:3]
+        self.place = pose_decoder(self.settings.pose_type)(data)[1:3]
 
     def _report_now(self) -> None:
         self._last_ns = self.get_clock().now().nanoseconds

@@ -17,7 +17,7 @@ from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.parameters import RelayParameters
 from agv_plant.radio.channel import Channel
 from agv_plant.radio.link import Link, Passage
-from agv_ros.codec import decode_command, decode_odometry, decode_pose, encode_slot, encode_twist, stamp_of
+from agv_ros.codec import decode_command, encode_slot, encode_twist, pose_decoder, stamp_of
 from agv_ros.endpoints import Output
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST
@@ -41,8 +41,8 @@ class RelayNode(LoopNode[RelayParameters]):
         )
         self._needs_place = settings.uplink.is_placed or settings.downlink.is_placed
         self._place = NOWHERE
-        self._is_odometry, self._loses_stamp = settings.pose_type == ODOMETRY, settings.command_type == TWIST
-        pose_kind = Odometry if self._is_odometry else PoseStamped
+        self._decode_pose, self._loses_stamp = pose_decoder(settings.pose_type), settings.command_type == TWIST
+        pose_kind = Odometry if settings.pose_type == ODOMETRY else PoseStamped
         kind, self._command = (MultiDOFJointTrajectory, "plan") if settings.plan_steps else (TwistStamped, "cmd_vel")
         self._agv, self._edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
         self._edge_pose = self.output(pose_kind, "edge/pose", on=self._edge)
@@ -71,7 +71,7 @@ class RelayNode(LoopNode[RelayParameters]):
         if self._agv is not self._edge and not self.uplink.sent:
             self._look_for_ways_around()  # before the first pose is passed on, and every now and then from then on
         if self._needs_place:
-            self._place = _place_in(data, self._is_odometry, self._place)
+            self._place = self._place_in(data)
         passage = self.uplink.transmit(stamp_of(data), data, self._place)
         self.report_every_second(passage.slot.stamp_ns)
         _pass_on(passage, self._edge_pose, self._edge_slot)
@@ -81,6 +81,13 @@ class RelayNode(LoopNode[RelayParameters]):
         passage = self.downlink.transmit(stamp_of(data), passed_on, self._place)
         _pass_on(passage, self._agv_cmd_vel, self._agv_slot)
 
+    def _place_in(self, pose: bytes) -> tuple[float, float]:
+        """Where a pose says that the AGV is [m]; the last place if it cannot be read, which its receiver reports."""
+        try:
+            return self._decode_pose(pose)[1:3]
+        except InvalidMessageError:
+            return self._place
+
     def facts(self) -> dict[str, str]:
         """What each link did to its messages so far."""
         return self.uplink.facts("uplink") | self.downlink.facts("downlink")
@@ -89,14 +96,6 @@ class RelayNode(LoopNode[RelayParameters]):
         """Changed loss parameters hold from the next slot on."""
         self.uplink.channel.parameters = self.settings.uplink
         self.downlink.channel.parameters = self.settings.downlink
-
-
-def _place_in(pose: bytes, is_odometry: bool, last: tuple[float, float]) -> tuple[float, float]:
-    """Where a pose says that the AGV is [m]; `last` if it cannot be read, which its receiver reports."""
-    try:
-        return (decode_odometry(pose) if is_odometry else decode_pose(pose))[1:3]
-    except InvalidMessageError:
-        return last
 
 
 def _pass_on(passage: Passage, forward: Output, outcome: Output) -> None:

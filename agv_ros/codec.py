@@ -22,9 +22,10 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 
+from agv_ros.message_types import ODOMETRY, POSE
 from agv_ros.messages import (
     FRAME_AGV,
     FRAME_MAP,
@@ -215,6 +216,11 @@ def decode_error(data: bytes) -> TrackingError:
 def decode_odometry(data: bytes) -> StampedPose:
     """nav_msgs/Odometry, the pose in it; theta in (-pi, pi]. Raises InvalidMessageError."""
     return StampedPose(*decode_error(data)[:4])
+
+
+def pose_decoder(pose_type: str) -> Callable[[bytes], StampedPose]:
+    """What reads poses of this type, one of `POSE_TYPES`."""
+    return {POSE: decode_pose, ODOMETRY: decode_odometry}[pose_type]
 
 
 def encode_slot(slot: Slot) -> bytes:

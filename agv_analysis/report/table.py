@@ -212,6 +212,13 @@ def metres(value: float) -> str:
     return f"{value:.3g} m" if value <= DIVERGED else "diverges"
 
 
+def percent(probability: float) -> str:
+    """A probability in three digits, never rounded to certainty."""
+    if 0.999 < probability < 1.0:
+        return "above 99.9 %"
+    return "below 0.1 %" if 0.0 < probability < 0.001 else f"{100.0 * probability:.3g} %"
+
+
 def _excursion(found: LastExcursion | None) -> str:
     if found is None:
         return "none"

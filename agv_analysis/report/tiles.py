@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
-from agv_analysis.report.table import metres
+from agv_analysis.report.table import metres, percent
 from agv_analysis.stability.analysis import Analysis, Observations
 from agv_analysis.stability.verdict import GREEN
 
@@ -53,12 +53,9 @@ def _word(analysis: Observations) -> tuple[str, str]:
 
 
 def confidence_text(probability: float) -> str:
-    """How probable a stable loop is given the losses that were seen; never rounded to certainty."""
-    if 0.999 < probability < 1.0:
-        return "stable with a probability above 99.9 %"
-    if 0.0 < probability < 0.001:
-        return "stable with a probability below 0.1 %"
-    return f"stable with a probability of {100.0 * probability:.3g} %"
+    """How probable a stable loop is given the losses that were seen."""
+    shown = percent(probability)
+    return f"stable with a probability {shown if shown[0].isalpha() else f'of {shown}'}"
 
 
 def _corridor(within: CorridorOfRun | None) -> tuple[str, str]:

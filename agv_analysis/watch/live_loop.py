@@ -15,8 +15,8 @@ from agv_analysis.watch.message_log import Heard
 from agv_analysis.watch.step_ring import StepRing, column
 from agv_cloud.parameters import PATH
 from agv_cloud.reference.reference import Reference
-from agv_ros.codec import decode_command, decode_error, decode_odometry, decode_pose, decode_slot
-from agv_ros.message_types import ODOMETRY, TWIST
+from agv_ros.codec import decode_command, decode_error, decode_slot, pose_decoder
+from agv_ros.message_types import TWIST
 from agv_ros.messages import DELAYED, LOST, InvalidMessageError
 from agv_ros.stamps import AGREEING, to_nanoseconds
 
@@ -67,7 +67,7 @@ class LiveLoop:
         self._is_timed = detector.trigger == "timer"
         is_known = detector.track != PATH and self._on_grid and not self._is_timed
         self._reference = Reference(detector) if is_known else None
-        decode = decode_odometry if scenario.relay.pose_type == ODOMETRY else decode_pose
+        decode = pose_decoder(scenario.relay.pose_type)
         command = TOPICS.index("edge/cmd_vel" if scenario.relay.command_type == TWIST else "agv/cmd_vel")
         self._on: dict[int, Callable[[bytes], None]] = {
             TOPICS.index("edge/slot"): self._on_slot,

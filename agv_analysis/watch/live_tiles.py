@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from agv_analysis.corridor.widths import widths_of
 from agv_analysis.metrics.bands import TOLERANCE
+from agv_analysis.report.table import percent
 from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin
 from agv_analysis.watch.live_loop import POINTS, LiveLoop
 
@@ -62,15 +63,8 @@ def _verdict(margin: LinkMargin | None, deadlines: dict[str, str]) -> LiveTile:
     if margin.probability_stable is None:
         return LiveTile("word", label, margin.word, margin.reason, BAD if margin.word == UNSTABLE else FAIR)
     mood = {STABLE: GOOD, UNSTABLE: BAD}.get(margin.word, FAIR)
-    sure = f"in mean square, {_percent(margin.probability_stable)} probable ({margin.slots} slots)"
+    sure = f"in mean square, {percent(margin.probability_stable)} probable ({margin.slots} slots)"
     return LiveTile("word", label, margin.word, sure if margin.word == STABLE else f"stable {sure}", mood)
-
-
-def _percent(share: float) -> str:
-    """A probability, never rounded to certainty."""
-    if 0.999 < share < 1.0:
-        return "> 99.9 %"
-    return "< 0.1 %" if 0.0 < share < 0.001 else f"{100.0 * share:.3g} %"
 
 
 def _deviation(loop: LiveLoop, largest: float) -> LiveTile:
