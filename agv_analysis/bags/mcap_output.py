@@ -71,7 +71,10 @@ class McapOutput:
         metadata: tuple[str, Mapping[str, str]],
         sync: bool,
     ) -> None:
-        """`metadata` goes first. `sync`: wait for the disk, beside the loop, as often as the file is flushed."""
+        """`metadata` goes first, if there is any.
+
+        `sync`: wait for the disk, beside the loop, as often as the file is flushed.
+        """
         self.path = path
         self.topics: dict[int, TopicInfo] = {}
         """Those that are in the file, by number."""
@@ -83,7 +86,8 @@ class McapOutput:
         self._synced: Future[None] | None = None
         library = f"agv_ncs {metadata[1].get('version', '')}".strip()
         self._writer = McapWriter(self._file, _CHUNK, library)
-        self._writer.add_metadata(*metadata)
+        if metadata[1]:
+            self._writer.add_metadata(*metadata)
 
     def write(self, messages: Iterable[Recorded]) -> None:
         """Add messages. Raises OSError."""

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from agv_analysis.commands import OUTPUT, with_force, write_json
+from agv_analysis.commands import OUTPUT, needs_ros, with_force, write_json
 
 if TYPE_CHECKING:
     from agv_analysis.identify.bearable_gains import BearableGains
     from agv_analysis.identify.fit import Interval
     from agv_analysis.identify.robot import IdentifiedRobot, IdentifiedSpeed
+    from agv_analysis.recordings.robot_topics import RobotTopics
 
 
 @click.command("identify")
@@ -29,11 +30,19 @@ if TYPE_CHECKING:
     "--params", "params_file", type=OUTPUT,
     help="Write the params file of a plant that behaves like this robot, for `agv-ncs stability` and the others.",
 )  # fmt: skip
+@click.option(
+    "--live",
+    "seconds",
+    type=click.FloatRange(min=1.0),
+    metavar="SECONDS",
+    help="First record BAG, which must not exist, from the running robot for so long; Ctrl-C ends that earlier.",
+)
 @click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
 @with_force
 def command(
     bag: Path, pose_topic: str | None, pose_frames: tuple[str, str] | None, command_topic: str | None,
-    topics: Path | None, wheelbase: float | None, params_file: Path | None, json_file: Path | None,
+    topics: Path | None, wheelbase: float | None, params_file: Path | None, seconds: float | None,
+    json_file: Path | None,
 ) -> None:  # fmt: skip
     """Say from the recording BAG of any robot how it follows its commands: dead time, lag, gain and slip of v and w.
 
@@ -44,6 +53,7 @@ def command(
       agv-ncs identify robot --pose-topic /odom --command-topic /cmd_vel
       agv-ncs identify robot --pose-topic /odom --command-topic /cmd_vel --params robot.yaml --json robot.json
       agv-ncs identify bags/first
+      agv-ncs identify bags/now --live 60 --pose-topic /odom --command-topic /cmd_vel
     """
     from rich.console import Console
 
@@ -55,6 +65,8 @@ def command(
 
     usual = (None, None) if topics is not None else ("/agv/pose", "/agv/cmd_vel")
     names = read_topics(topics, pose_topic or usual[0], command_topic or usual[1], None)
+    if seconds is not None:
+        _record(bag, names, seconds)
     with Console(stderr=True).status("fitting ..."):
         robot = identify_recording(bag, names, pose_frames, wheelbase)
         gains = bearable_gains(robot)
@@ -82,6 +94,26 @@ def command(
         )
 
 
+def _record(bag: Path, names: RobotTopics, seconds: float) -> None:
+    """Record the topics of pose and command of the running robot."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from agv_analysis.identify.robot import command_topic
+
+    with needs_ros():
+        from agv_analysis.runtime.topic_recorder_node import record_topics
+    from agv_ros.discovery import discovery_note
+
+    topics = [names.pose, command_topic(names)]
+    click.echo(discovery_note(), err=True)
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task(f"recording {' and '.join(topics)}", total=seconds)
+        counts = record_topics(bag, topics, seconds, lambda heard: progress.update(task, completed=heard))
+    recorded = ", ".join(f"{count} messages of {topic}" for topic, count in zip(topics, counts, strict=True))
+    click.echo(f"bag: {bag} ({recorded})")
+
+
 def _lines(robot: IdentifiedRobot) -> list[str]:
     return [
         f"Poses every {robot.pose_period * 1e3:.3g} ms, commands every {robot.command_period * 1e3:.3g} ms (medians).",
@@ -93,7 +125,9 @@ def _of_speed(speed: IdentifiedSpeed) -> list[str]:
     """What is known of a speed, a line each."""
     title = f"{speed.named.key} ({speed.named.meaning})"
     if speed.fit is None:
-        return [f"{title}: no number. {speed.reason[0].upper()}{speed.reason[1:]}."]
+        return [
+            f"{title}: no number. {speed.reason[0].upper()}{speed.reason[1:]}{'' if speed.reason[-1] == '?' else '.'}"
+        ]
     assert speed.slip is not None
     return [
         f"{title}, each with its 95 % interval:",

@@ -43,6 +43,9 @@ _REACH, _LEAST_REACH, _ROUNDS = 3.0, 2e-3, 10
 _SMALL = 2e-3
 """Step [s] of derivatives with respect to dead time and lag."""
 
+_RESOLUTION = 1e-6
+"""What no increment is known better than [m or rad]: a simulator's poses without any noise have intervals, too."""
+
 _NOTHING = 1e-20
 
 
@@ -183,7 +186,7 @@ class _Problem(NamedTuple):
             power = np.einsum("dn,dn->d", x, x)
             there = power > _NOTHING
             gain = np.where(there, x @ y / np.where(there, power, 1.0), 0.0)
-            squares[i] = np.where(there, np.maximum(y @ y - gain * gain * power, _NOTHING), np.inf)
+            squares[i] = np.where(there, np.maximum(y @ y - gain * gain * power, 0.0) + len(y) * _RESOLUTION**2, np.inf)
             gains[i], curvatures[i] = gain, power
         return _Grid(lags, dead_times, squares, gains, curvatures, len(self.seen.moved))
 
@@ -276,7 +279,7 @@ class _Problem(NamedTuple):
     def spread(self, noise: IncrementNoise, best: _Point) -> _Spread:
         """How far the estimates may be off, by the slopes at the best fit."""
         slopes, left = self.slopes(noise, best)
-        inverse, variance = np.linalg.pinv(slopes @ slopes.T), float(left @ left) / len(left)
+        inverse, variance = np.linalg.pinv(slopes @ slopes.T), float(left @ left) / len(left) + _RESOLUTION**2
         real = np.diag(inverse @ _long_run(slopes * left) @ inverse)
         ratios = real / np.maximum(variance * np.diag(inverse), 1e-300)
         earlier, scale = slopes[0], slopes[2]

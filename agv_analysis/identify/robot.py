@@ -126,10 +126,15 @@ def identify_recording(
     `pose_frames`: fixed and robot's frame of transforms; `wheelbase` [m]: of a car whose commands are steering angles.
     """
     bag, poses = read_robot_poses(path, topics, pose_frames)
+    instants, commands, notes = sent_commands(bag, command_topic(topics), poses, wheelbase)
+    return identify(instants, commands, poses, str(path), (*bag.problems, *poses.notes, *notes))
+
+
+def command_topic(topics: RobotTopics) -> str:
+    """The topic of the commands. Raises UserError if none is named."""
     if topics.command is None:
         raise UserError("no topic of the commands: name it with --command-topic, or as `command:` in --topics")
-    instants, commands, notes = sent_commands(bag, topics.command, poses, wheelbase)
-    return identify(instants, commands, poses, str(path), (*bag.problems, *poses.notes, *notes))
+    return topics.command
 
 
 def identify(
