@@ -2,99 +2,192 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import multiprocessing
 import os
-import random
+import signal
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import click
 
+from fuzz.__main__ import add
+from fuzz.campaign import Result
 from fuzz.campaign import run as fuzz
 from torture.by_hand import faults_by_hand, run_by_hand
-from torture.kills import Case, cases, faults, run
-from torture.wire import attack
+from torture.forked import import_all
+from torture.kills import IN_TIME, Case, faults, in_fair_order, run
+from torture.wire import Attacked, attack
 
 PARAMS = str(Path(__file__).parents[1] / "config/outages.yaml")
 
-_SHARES = {"kills": 0.7, "wire": 0.2, "bags": 0.1}
-"""Of the time."""
+_SHARES = {"kills": 0.6, "wire": 0.05, "bags": 0.35}
+"""Of the time; what one part leaves, those after it may use."""
+
+_ATTACKS, _ATTACKED_RUNS = 250, 4
+"""Messages that attack a run, and the fewest runs: two in each clock."""
+
+_BAGS, _BAGS_AT_A_TIME = 50_000, 100
+
+_FIRST_DOMAIN = 93
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @click.command()
 @click.option("--minutes", type=click.FloatRange(min=0.1), default=20.0, show_default=True, help="How long, at most.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of the order of the kills, and of the attacks.")
+@click.option(
+    "--jobs", type=click.IntRange(1, 8), default=min(8, 2 * len(os.sched_getaffinity(0))), show_default="two a core",
+    help="Runs side by side, each in a DDS domain of its own.",
+)  # fmt: skip
+@click.option("--only", type=click.Choice([*_SHARES]), help="One part alone.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
-def main(minutes: float, seed: int, json_file: Path | None) -> None:
+def main(minutes: float, seed: int, jobs: int, only: str | None, json_file: Path | None) -> None:
     """Try to break runs and recordings; exit status 1 if anything did not hold."""
-    os.environ.setdefault("ROS_DOMAIN_ID", "93")
+    import_all()
     found: dict[str, dict[str, Any]] = {}
+    end = time.monotonic()
     for name, part in (("kills", _kills), ("wire", _wire), ("bags", _bags)):
+        if only not in (None, name):
+            continue
+        begun = time.monotonic()
+        end += 60.0 * minutes * (_SHARES[name] if only is None else 1.0)
         with tempfile.TemporaryDirectory(prefix="agv_ncs_torture_") as folder:
-            found[name] = part(seed, time.monotonic() + 60.0 * minutes * _SHARES[name], Path(folder))
+            found[name] = part(seed, end, Path(folder), jobs) | {"minutes": round((time.monotonic() - begun) / 60.0, 1)}
         if json_file is not None:
             json_file.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
-        click.echo(f"{name}: {found[name]['cases']} cases, {found[name]['bad']} of them not as they should be")
+        click.echo(_line(name, found[name]))
     raise SystemExit(any(part["bad"] for part in found.values()))
 
 
-def _kills(seed: int, end: float, folder: Path) -> dict[str, Any]:
-    order = list(cases())
-    random.Random(seed).shuffle(order)
+def _line(name: str, part: dict[str, Any]) -> str:
+    late = f", {part['late']} in more than {IN_TIME:g} s for want of a processor" if part.get("late") else ""
+    return (
+        f"{name}: {part['cases']} of {part['of']} cases in {part['minutes']} min, "
+        f"{part['bad']} not as they should be{late}"
+    )
+
+
+# -- workers -----------------------------------------------------------------------------------------------------------
+
+
+def _start_worker(domains: multiprocessing.Queue[int]) -> None:
+    """First thing in a worker: a DDS domain of its own; Ctrl-C is the first process' to handle."""
+    os.environ["ROS_DOMAIN_ID"] = str(domains.get())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _side_by_side(jobs: int, end: float, work: Callable[[T], R], tasks: Iterable[T]) -> Iterator[tuple[T, R]]:
+    """Do tasks in worker processes, in order, beginning none after `end`; each result as soon as it is there."""
+    context = multiprocessing.get_context("fork")  # what is imported here is imported there
+    domains: multiprocessing.Queue[int] = context.Queue()
+    first = int(os.environ.get("ROS_DOMAIN_ID", _FIRST_DOMAIN))
+    for number in range(jobs):
+        domains.put(first + number)
+    waiting, running = iter(tasks), {}
+    with ProcessPoolExecutor(jobs, context, _start_worker, (domains,)) as pool:
+        while True:
+            free = jobs - len(running) if time.monotonic() < end else 0
+            for task in itertools.islice(waiting, free):
+                running[pool.submit(work, task)] = task
+            if not running:
+                return
+            done: set[Future[R]] = wait(running, return_when=FIRST_COMPLETED).done
+            for future in done:
+                yield running.pop(future), future.result()
+
+
+# -- signals -----------------------------------------------------------------------------------------------------------
+
+
+class _Seen(NamedTuple):
+    """What came of a signal."""
+
+    wrong: list[str]
+    seconds: float
+    starved: float
+    said: str
+
+
+def _kills(seed: int, end: float, folder: Path, jobs: int) -> dict[str, Any]:
+    order = in_fair_order(seed)
     bad: dict[str, list[str]] = {}
-    done, longest = 0, 0.0
-    for case in order:
-        if time.monotonic() > end:
-            break
-        with tempfile.TemporaryDirectory(dir=folder) as own:
-            wrong, seconds, said = _by_hand(case, Path(own)) if case.start == "hand" else _by_runner(case, Path(own))
+    late: dict[str, str] = {}
+    longest, done = 0.0, 0
+    for (case, _), seen in _side_by_side(jobs, end, _kill, [(case, folder) for case in order]):
         done += 1
-        if case.number.name != "SIGSTOP":
-            longest = max(longest, seconds)
-        if wrong:
-            bad[str(case)] = [*wrong, said.strip().rpartition("\n")[2]]
+        if case.number != signal.SIGSTOP:
+            longest = max(longest, seen.seconds - seen.starved)
+            if seen.seconds > IN_TIME:
+                late[str(case)] = f"{seen.seconds:.1f} s, {seen.starved:.1f} s of it without a processor"
+        if seen.wrong:
+            bad[str(case)] = [*seen.wrong, seen.said.strip().rpartition("\n")[2]]
             click.echo(f"{case}: {'; '.join(bad[str(case)])}")
-    return {"cases": done, "of": len(order), "bad": len(bad), "longest_s": round(longest, 2), "faults": bad}
+    return {
+        "cases": done, "of": len(order), "bad": len(bad), "late": len(late), "longest_s": round(longest, 2),
+        "faults": bad, "late_cases": late,
+    }  # fmt: skip
 
 
-def _by_runner(case: Case, folder: Path) -> tuple[list[str], float, str]:
-    """Faults, seconds to the end, and what was said."""
-    ended = run(case, folder, PARAMS)
-    return faults(case, ended, folder / "bag"), ended.seconds, ended.said
+def _kill(task: tuple[Case, Path]) -> _Seen:
+    case, folder = task
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        own = Path(name)
+        if case.start == "hand":
+            alone = run_by_hand(case, own, PARAMS)
+            seconds = max(alone.victim_seconds, alone.seconds)
+            return _Seen(faults_by_hand(case, alone, own / "bag"), seconds, alone.starved, alone.said["plant"])
+        ended = run(case, own, PARAMS)
+        return _Seen(faults(case, ended, own / "bag"), ended.seconds, ended.starved, ended.said)
 
 
-def _by_hand(case: Case, folder: Path) -> tuple[list[str], float, str]:
-    ended = run_by_hand(case, folder, PARAMS)
-    return faults_by_hand(case, ended, folder / "bag"), max(ended.victim_seconds, ended.seconds), ended.said["plant"]
+# -- wild messages -----------------------------------------------------------------------------------------------------
 
 
-def _wire(seed: int, end: float, folder: Path) -> dict[str, Any]:
+def _wire(seed: int, end: float, folder: Path, jobs: int) -> dict[str, Any]:
     bad: dict[str, list[str]] = {}
     kinds: Counter[str] = Counter()
-    runs = 0
-    while time.monotonic() < end:
-        clock = ("realtime", "lockstep")[runs % 2]
-        with tempfile.TemporaryDirectory(dir=folder) as own:
-            found = attack(seed + runs, clock, 250, Path(own), PARAMS)
+    tasks = [(seed + number, ("realtime", "lockstep")[number % 2], folder) for number in range(_ATTACKED_RUNS)]
+    for (number, clock, _), found in _side_by_side(min(jobs, 2), end, _attack, tasks):
         kinds.update(found.by_kind)
         if found.faults:
-            bad[f"{clock}, seed {seed + runs}"] = [*found.faults, found.said.strip().rpartition("\n")[2]]
-            click.echo(f"wire, {clock}, seed {seed + runs}: {'; '.join(found.faults)}")
-        runs += 1
-    return {"cases": sum(kinds.values()), "runs": runs, "bad": len(bad), "kinds": dict(kinds), "faults": bad}
+            bad[f"{clock}, seed {number}"] = [*found.faults, found.said.strip().rpartition("\n")[2]]
+            click.echo(f"wire, {clock}, seed {number}: {'; '.join(found.faults)}")
+    sent, of = sum(kinds.values()), _ATTACKS * _ATTACKED_RUNS
+    return {"cases": sent, "of": of, "bad": len(bad), "kinds": dict(kinds), "faults": bad}
 
 
-def _bags(seed: int, end: float, folder: Path) -> dict[str, Any]:
-    cases_done = 0
-    bad: Counter[str] = Counter()
-    while time.monotonic() < end:
-        found = fuzz(seed, range(cases_done, cases_done + 200), folder, None)
-        cases_done += sum(found.cases.values())
-        bad.update(found.faults)
-    return {"cases": cases_done, "bad": sum(bad.values()), "faults": dict(bad)}
+def _attack(task: tuple[int, str, Path]) -> Attacked:
+    seed, clock, folder = task
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        return attack(seed, clock, _ATTACKS, Path(own), PARAMS)
+
+
+# -- damaged bags ------------------------------------------------------------------------------------------------------
+
+
+def _bags(seed: int, end: float, folder: Path, jobs: int) -> dict[str, Any]:
+    total = Result()
+    cores = min(jobs, len(os.sched_getaffinity(0)))  # nothing is waited for here
+    tasks = [(seed, first, folder) for first in range(0, _BAGS, _BAGS_AT_A_TIME)]
+    for _, found in _side_by_side(cores, end, _read, tasks):
+        add(total, found)
+    done = total.to_json()
+    return {"cases": done.pop("cases"), "of": _BAGS, "bad": sum(total.faults.values())} | done
+
+
+def _read(task: tuple[int, int, Path]) -> Result:
+    seed, first, folder = task
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        return fuzz(seed, range(first, first + _BAGS_AT_A_TIME), Path(own), None)
 
 
 if __name__ == "__main__":

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from agv_analysis.runtime.executables import run_node_of
 from agv_plant.plant_node import progress_line
 from torture.kills import (
     HALT,
@@ -25,6 +24,8 @@ from torture.kills import (
     recorded_bytes,
     until,
 )
+from torture.forked import Forked
+from torture.starvation import Starvation
 
 _OUTLIVES = 0.5
 """How long [s] a node that ended is waited for beyond what it needs, so that all others are asked at once."""
@@ -40,6 +41,8 @@ class EndedByHand(NamedTuple):
     """From the signal to the end of the process that got it; 0 for one that is only halted."""
     seconds: float
     """From the request to the end of those that were left after the plant, and then of the recorder; the longer one."""
+    starved: float
+    """For how long [s], of these times, nodes waited for a processor."""
     early: tuple[str, ...]
     """Nodes, neither plant nor the one that got the signal, that had ended before they were asked to."""
     orphans: tuple[str, ...]
@@ -47,18 +50,15 @@ class EndedByHand(NamedTuple):
 
 def run_by_hand(case: Case, folder: Path, params: str) -> EndedByHand:
     """Start the nodes one by one, recorded to `folder`/bag, send the signal, wait for the plant and end the others."""
-    begun: dict[str, subprocess.Popen[str]] = {}
+    begun: dict[str, Forked] = {}
     try:
         for node in NODES[1:]:
-            with (folder / f"{node}.log").open("w") as log:
-                words = [sys.executable, "-m", "agv_analysis.cli", "node", node]
-                words += _arguments(node, case, folder, params)
-                begun[node] = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=log, stderr=log, text=True)
+            words = list(_arguments(node, case, folder, params))
+            begun[node] = Forked(functools.partial(run_node_of, node, words), folder / f"{node}.log")
         return _hurt(case, folder, begun)
     finally:
         for process in begun.values():
             process.kill()
-            process.wait()
 
 
 def _arguments(node: str, case: Case, folder: Path, params: str) -> Iterator[str]:
@@ -74,22 +74,21 @@ def _arguments(node: str, case: Case, folder: Path, params: str) -> Iterator[str
         yield from ("-p", f"{name}:={value}")
 
 
-def _hurt(case: Case, folder: Path, begun: dict[str, subprocess.Popen[str]]) -> EndedByHand:
+def _hurt(case: Case, folder: Path, begun: dict[str, Forked]) -> EndedByHand:
     plant, victim = begun["plant"], begun[case.node]
-    share, log = SHARE[case.moment], folder / f"{case.node}.log"
+    share = SHARE[case.moment]
     if share is None:
-        until(victim, lambda: "[INFO]" in log.read_text())
+        until(victim, lambda: "[INFO]" in victim.said())
     else:
         until(plant, lambda: recorded_bytes(folder / "bag") > share * STEPS[case.clock])
-    sent = time.monotonic()
-    with contextlib.suppress(ProcessLookupError):
-        victim.send_signal(case.number)
-        if case.number == signal.SIGSTOP:
-            time.sleep(HALT)
-            victim.send_signal(signal.SIGCONT)
+    sent, starvation = time.monotonic(), Starvation(process.pid for process in begun.values())
+    victim.send_signal(case.number)
+    if case.number == signal.SIGSTOP:
+        time.sleep(HALT)
+        victim.send_signal(signal.SIGCONT)
     victim_seconds = 0.0
     if case.number != signal.SIGSTOP:
-        until(None, lambda: victim.poll() is not None)
+        until(None, lambda: victim.poll() is not None, watched=starvation)
         victim_seconds = time.monotonic() - sent
     if share is not None or case.number == signal.SIGSTOP:
         until(plant, lambda: False)
@@ -99,15 +98,16 @@ def _hurt(case: Case, folder: Path, begun: dict[str, subprocess.Popen[str]]) -> 
     seconds, recorder = 0.0, begun["recorder"]
     for group in ([process for process in begun.values() if process is not recorder], [recorder]):
         asked = time.monotonic()
+        starvation.look()
         for process in group:
-            process.send_signal(signal.SIGINT)  # does nothing to one that has ended
-        until(None, lambda group=group: all(process.poll() is not None for process in group))  # type: ignore[misc]
+            process.send_signal(signal.SIGINT)
+        until(None, lambda group=group: all(p.poll() is not None for p in group), watched=starvation)  # type: ignore[misc]
         seconds = max(seconds, time.monotonic() - asked)
     orphans = tuple(node for node, process in begun.items() if process.poll() is None)
     return EndedByHand(
         {node: process.returncode for node, process in begun.items() if process.returncode is not None},
-        {node: (folder / f"{node}.log").read_text(errors="replace") for node in begun},
-        victim_seconds, seconds, early, orphans,
+        {node: process.said() for node, process in begun.items()},
+        victim_seconds, seconds, starvation.seconds, early, orphans,
     )  # fmt: skip
 
 
@@ -115,10 +115,9 @@ def faults_by_hand(case: Case, ended: EndedByHand, bag: Path) -> list[str]:
     """What is not as it should be, in words; empty if all is."""
     found = [f"{node} does not end" for node in ended.orphans]
     found += [f"{node} ended by itself" for node in ended.early]
-    if ended.victim_seconds > IN_TIME:
-        found.append(f"{case.node} ended after {ended.victim_seconds:.1f} s")
-    if ended.seconds > IN_TIME:
-        found.append(f"the others ended after {ended.seconds:.1f} s")
+    for whose, seconds in ((f"the {case.node}", ended.victim_seconds), ("the others", ended.seconds)):
+        if seconds - ended.starved > IN_TIME:
+            found.append(f"{whose} ended after {seconds:.1f} s, {ended.starved:.1f} s of it without a processor")
     found += [f"{node} said a traceback" for node, said in ended.said.items() if "Traceback" in said]
     found += [wrong for node, status in ended.statuses.items() if (wrong := _wrong_status(case, node, status, ended))]
     return found + lost_steps(case, "\n".join(ended.said.values()), bag)

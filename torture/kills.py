@@ -5,18 +5,21 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import random
 import re
 import signal
-import subprocess
-import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from agv_analysis.cli import main as command_line
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.runtime.shared_memory import held_by, leftovers
 from agv_ros.errors import UserError
+from torture.forked import Forked
+from torture.starvation import Starvation
 
 NODES = ("runner", "recorder", "controller", "error_detector", "relay", "plant")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGSTOP)
@@ -26,7 +29,7 @@ STARTS = ("runner", "hand")
 """Who starts the nodes: `agv-ncs run --processes`, or a person one by one."""
 
 IN_TIME = 5.0
-"""How long [s] a run may take to end after the signal, on a machine that is not busy."""
+"""How long [s] a run may take to end after the signal, beside what its processes wait for a processor."""
 
 MOST_LOST = {"lockstep": 1000, "realtime": 40 + 20}
 """Steps that may be lost with a recorder that is killed: in real time 0.2 s, and what was on its way to it."""
@@ -34,7 +37,7 @@ MOST_LOST = {"lockstep": 1000, "realtime": 40 + 20}
 HALT = 2.0
 """How long [s] SIGSTOP halts a process."""
 
-STEPS = {"lockstep": 6000, "realtime": 800}
+STEPS = {"lockstep": 2000, "realtime": 500}
 TS = 0.005
 _BYTES_A_STEP = 100
 """Fewest that a step adds to the recording."""
@@ -67,6 +70,8 @@ class Ended(NamedTuple):
     said: str
     seconds: float
     """From the signal to the end."""
+    starved: float
+    """How much of it [s] processes of the run waited for a processor."""
     orphans: tuple[str, ...]
     """Processes of the run that outlived it."""
     left: tuple[Path, ...]
@@ -80,6 +85,24 @@ def cases() -> Iterator[Case]:
             yield Case(node, number, clock, moment, start)
 
 
+def in_fair_order(seed: int) -> list[Case]:
+    """All cases, shuffled so that the first ones are a fair sample, however many there are.
+
+    The next case is always one whose pairs of properties (this node with this signal, this clock at this moment, ...)
+    have come least often so far.
+    """
+    left = list(cases())
+    random.Random(seed).shuffle(left)
+    seen: Counter[tuple[object, ...]] = Counter()
+    order = []
+    while left:
+        case = min(left, key=lambda case: sum(seen[pair] for pair in itertools.combinations(case, 2)))
+        left.remove(case)
+        seen.update(itertools.combinations(case, 2))
+        order.append(case)
+    return order
+
+
 def outage_settings(case: Case) -> dict[str, str]:
     """Parameters of the relay: for the moment in an outage one that begins after 0.2 s and does not end."""
     return {"uplink.schedule": "0.2: outage=1000"} if case.moment == "outage" else {}
@@ -88,14 +111,12 @@ def outage_settings(case: Case) -> dict[str, str]:
 def run(case: Case, folder: Path, params: str) -> Ended:
     """Start a run of the params file in processes, recorded to `folder`/bag, send the signal, and wait for its end."""
     steps = STEPS[case.clock]
-    command = [sys.executable, "-m", "agv_analysis.cli", "run", params, "--processes", "--clock", case.clock]
-    command += ["--duration", str(steps * TS), "--bag", str(folder / "bag")]
+    arguments = ["run", params, "--processes", "--clock", case.clock]
+    arguments += ["--duration", str(steps * TS), "--bag", str(folder / "bag")]
     for name, value in outage_settings(case).items():
-        command += ["--set", f"relay.{name}={value}"]
-    runner = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    family, held = {}, []
+        arguments += ["--set", f"relay.{name}={value}"]
+    runner = Forked(lambda: command_line(arguments), folder / "runner.log")
+    family: dict[str, int] = {}
     try:
         until(runner, lambda: len(_children(runner.pid)) == len(NODES) - 1)
         family = _children(runner.pid)
@@ -104,27 +125,36 @@ def run(case: Case, folder: Path, params: str) -> Ended:
             until(runner, lambda: recorded_bytes(folder / "bag") > share * steps)
         victim = runner.pid if case.node == "runner" else family.get(case.node)
         held = [] if victim is None else held_by(victim)
-        with contextlib.suppress(ProcessLookupError):
-            if victim is None:
-                raise ProcessLookupError(case.node)  # the run has ended before: what it said is judged below
-            os.kill(victim, case.number)
-            if case.number == signal.SIGSTOP:
-                time.sleep(HALT)
-                os.kill(victim, signal.SIGCONT)
-        begun = time.monotonic()
-        said, _ = runner.communicate(timeout=PATIENCE)
-        until(None, lambda: not any(map(_runs, family.values())), 4.0)
-        seconds = time.monotonic() - begun
-        left = {one.path for one in leftovers(settled=0.0)}.intersection(held)
-        orphans = tuple(n for n, pid in family.items() if _runs(pid))
-        return Ended(runner.returncode, said, seconds, orphans, tuple(sorted(left)))
+        if runner.poll() is None:  # else the run has ended before: what it said is judged
+            _send(victim, case.number)
+        return _ended(runner, family, held)
     finally:
-        for pid in [runner.pid, *family.values()]:
-            with contextlib.suppress(ProcessLookupError):
-                if pid == runner.pid and runner.poll() is not None:
-                    continue
-                os.kill(pid, signal.SIGKILL)
-        runner.wait()
+        runner.kill()
+        for pid in family.values():
+            _send(pid, signal.SIGKILL)
+
+
+def _send(pid: int | None, number: signal.Signals) -> None:
+    """Send a signal; one that halts is followed, after a while, by the one that lets go on."""
+    with contextlib.suppress(ProcessLookupError):
+        if pid is not None:
+            os.kill(pid, number)
+            if number == signal.SIGSTOP:
+                time.sleep(HALT)
+                os.kill(pid, signal.SIGCONT)
+
+
+def _ended(runner: Forked, family: dict[str, int], held: list[Path]) -> Ended:
+    """Wait for the end of a run and of all of its processes."""
+    begun, starvation = time.monotonic(), Starvation((runner.pid, *family.values()))
+    until(runner, lambda: False, watched=starvation)
+    until(None, lambda: not any(map(_runs, family.values())), 4.0, starvation)
+    seconds = time.monotonic() - begun
+    left = {one.path for one in leftovers(settled=0.0)}.intersection(held) if held else set()
+    orphans = tuple(n for n, pid in family.items() if _runs(pid))
+    status = runner.poll()
+    said = runner.said() + ("" if status is not None else "it does not end")
+    return Ended(99 if status is None else status, said, seconds, starvation.seconds, orphans, tuple(sorted(left)))
 
 
 def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
@@ -132,8 +162,8 @@ def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
     found = [f"{node} outlived the run" for node in ended.orphans]
     if case.number == signal.SIGKILL and case.node != "runner" and case.moment != "start":
         found += [f"left {path}" for path in ended.left]
-    if ended.seconds > IN_TIME and case.number != signal.SIGSTOP:
-        found.append(f"ended after {ended.seconds:.1f} s")
+    if ended.seconds - ended.starved > IN_TIME and case.number != signal.SIGSTOP:
+        found.append(f"ended after {ended.seconds:.1f} s, {ended.starved:.1f} s of it without a processor")
     if "Traceback" in ended.said:
         found.append("said a traceback")
     return found + _wrong_status(case, ended) + lost_steps(case, ended.said, bag)
@@ -174,11 +204,15 @@ def _in_bag(bag: Path) -> tuple[int | None, dict[str, int]]:
     return int(found.k[-1]) + 1, dict(found.unexplained)
 
 
-def until(process: subprocess.Popen[str] | None, condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
+def until(
+    process: Forked | None, condition: Callable[[], bool], seconds: float = PATIENCE, watched: Starvation | None = None
+) -> None:
     """Wait for a condition, for so long at most, or until the process has ended."""
     deadline = time.monotonic() + seconds
     while not condition() and time.monotonic() < deadline and (process is None or process.poll() is None):
         time.sleep(0.01)
+        if watched is not None:
+            watched.look()
 
 
 def _children(pid: int) -> dict[str, int]:

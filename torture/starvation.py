@@ -1,0 +1,48 @@
+"""How long processes were ready to run and had no processor: time of a busy machine, not of the program's.
+
+Linux counts it for each thread (`/proc/<pid>/task/<tid>/schedstat`, nanoseconds on a run queue), so that it is measured
+where it happens. A program that waits, sleeps or computes for too long gains nothing by it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+_PERIOD = 0.05
+"""How often [s] it is looked, at most."""
+
+
+class Starvation:
+    """Watches processes: in each span of time the thread counts that waited longest for a processor."""
+
+    def __init__(self, pids: Iterable[int]) -> None:
+        self._pids = tuple(pids)
+        self._waited = self._read()
+        self._at = time.monotonic()
+        self.seconds = 0.0
+        """For how long so far one of them at least had to wait; at most what has passed."""
+
+    def look(self) -> None:
+        """Add what they have waited since the last look; to be called again and again."""
+        now = time.monotonic()
+        if now - self._at < _PERIOD:
+            return
+        waited = self._read()
+        # A thread that is new has waited since its beginning, which may be before the last look; it counts from now on.
+        longest = max((ns - self._waited.get(thread, ns) for thread, ns in waited.items()), default=0)
+        self.seconds += min(longest / 1e9, now - self._at)
+        self._waited, self._at = waited, now
+
+    def _read(self) -> dict[str, int]:
+        """Nanoseconds on a run queue by thread; none of processes that have ended."""
+        found: dict[str, int] = {}
+        for pid in self._pids:
+            with contextlib.suppress(OSError):
+                for thread in os.listdir(f"/proc/{pid}/task"):
+                    words = Path(f"/proc/{pid}/task/{thread}/schedstat").read_text().split()
+                    found[thread] = int(words[1])
+        return found
