@@ -8,7 +8,6 @@ does in lockstep, where answers take no time.
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -21,6 +20,7 @@ from trajectory_msgs.msg import MultiDOFJointTrajectory
 from agv_plant.deadline_monitor import DeadlineMonitor
 from agv_plant.downlink_policy import DOWNLINK_POLICIES, share_of_command
 from agv_plant.parameters import PlantParameters
+from agv_plant.progress_line import progress_line
 from agv_plant.random_stream import normals_of
 from agv_plant.vehicle.motion import NOISE, SLIP, Motion, measured, move, vehicle_parameters, vehicle_step
 from agv_plant.vehicle.registry import VEHICLES
@@ -30,11 +30,12 @@ from agv_ros.endpoints import RECORDER
 from agv_ros.executor import run_node
 from agv_ros.message_sync import Joined, MessageSync
 from agv_ros.messages import FRAME_AGV, Command, InvalidMessageError, StampedPose
-from agv_ros.node import STOPPED_BY, LoopNode
+from agv_ros.node import LoopNode
 from agv_ros.parts import complaint
 from agv_ros.pose import Pose
 from agv_ros.speeds_codec import decode_speeds
 from agv_ros.stamps import to_nanoseconds
+from agv_ros.stopping import STOPPED_BY
 from agv_ros.substitution import replaced
 from agv_ros.transforms import TransformBroadcaster
 
@@ -56,17 +57,6 @@ _PEERS = (("edge/slot", "relay"), ("edge/error", "error_detector"), ("edge/cmd_v
 
 _ONCE = (("agv/pose", "plant"), *_PEERS, ("agv/slot", "relay"), ("agv/cmd_vel", "relay"), ("/clock", "plant"))
 """What one node alone publishes, or else two loops have become one."""
-
-
-def progress_line(k: int, steps: float) -> str:
-    """What the plant logs of its progress."""
-    return f"step {k} of {steps}"
-
-
-def progress_of(line: str) -> int | None:
-    """The step in a line of the plant's log, None if the line is not about one."""
-    found = re.search(r"step (\d+) of \S+$", line)
-    return int(found[1]) if found else None
 
 
 class PlantNode(LoopNode[PlantParameters]):

@@ -31,6 +31,7 @@ from agv_ros.messages import CHANGED, PUBLISHED
 from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
 from agv_ros.qos import Input, create_publisher
 from agv_ros.stamps import LATEST_NS, Grid
+from agv_ros.stopping import STOPPED_BY
 
 P = TypeVar("P", bound=LoopParameters)
 
@@ -48,9 +49,6 @@ _OFFERS_PERIOD = 0.25
 
 _ACK_PERIOD = 0.1
 """For how long [s] at a time a node waits until its subscribers have acknowledged what it has sent."""
-
-STOPPED_BY = "stopped by "
-"""Begins the line that a node logs when it is asked to end before it has done its work."""
 
 ENDED = "ended"
 """Key in a node's last diagnostics: its counts of messages there are final."""

@@ -14,7 +14,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from agv_ros.executor import EXECUTORS, spin, stop_on_signals  # sets the discovery range before rclpy starts
+from agv_ros.executor import EXECUTORS, spin  # sets the discovery range before rclpy starts
+from agv_ros.stopping import stop_on_signals
 
 import rclpy  # isort: skip
 from geometry_msgs.msg import PoseStamped, TwistStamped

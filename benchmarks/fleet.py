@@ -85,7 +85,8 @@ def run(count: int, first: int, number: int) -> int:
     """
     from agv_analysis.runtime.one_process import OneProcess
     from agv_analysis.runtime.runner import loop_of, run_loops
-    from agv_ros.executor import EXECUTORS, stop_on_signals
+    from agv_ros.executor import EXECUTORS
+    from agv_ros.stopping import stop_on_signals
 
     scenario = load_scenario(CONFIG, ["plant.clock=realtime", "plant.duration=1000.0"])
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, 20.0), strict=True))

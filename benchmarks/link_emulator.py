@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_ros.executor import EXECUTORS, spin, spin_for, stop_on_signals
+from agv_ros.executor import EXECUTORS, spin, spin_for
+from agv_ros.stopping import stop_on_signals
 from benchmarks.comparison import Comparison
 
 HEARD, CALLED = "/benchmark", "/edge/benchmark"

@@ -137,7 +137,8 @@ def _two_hosts() -> Iterator[tuple[list[str], list[str], Any]]:
 
 def run(role: str, reliability: str, depth: int) -> None:
     """Body of a process: publish stamped messages, or listen to them and print what came when."""
-    from agv_ros.executor import EXECUTORS, spin, spin_for, stop_on_signals
+    from agv_ros.executor import EXECUTORS, spin, spin_for
+    from agv_ros.stopping import stop_on_signals
 
     import rclpy  # isort: skip
     from rclpy.node import Node

@@ -22,7 +22,8 @@ def test_the_node_of_the_page_drives_the_loop_and_is_not_judged(
     from agv_analysis.runtime.run_setup import AS_USUAL, params_file, recording_of, scenario_that_waits
     from agv_analysis.runtime.runner import NODES, Loop, run_loops
     from agv_analysis.scenario import load_scenario
-    from agv_ros.executor import EXECUTORS, stop_on_signals
+    from agv_ros.executor import EXECUTORS
+    from agv_ros.stopping import stop_on_signals
 
     names: dict[str, Any] = {"__name__": "page"}
     exec(compile(page_block("own_controller.md", "node"), "own_controller.md", "exec"), names)

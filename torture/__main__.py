@@ -92,7 +92,8 @@ def _side_by_side(jobs: int, end: float, work: Callable[[T], R], tasks: Iterable
     first = int(os.environ.get("ROS_DOMAIN_ID", _FIRST_DOMAIN))
     for number in range(jobs):
         domains.put(first + number)
-    waiting, running = iter(tasks), {}
+    waiting = iter(tasks)
+    running: dict[Future[R], T] = {}
     with ProcessPoolExecutor(jobs, context, _start_worker, (domains,)) as pool:
         while True:
             free = jobs - len(running) if time.monotonic() < end else 0

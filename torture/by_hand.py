@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from agv_analysis.runtime.executables import run_node_of
-from agv_plant.plant_node import progress_line
+from agv_plant.progress_line import progress_line
+from torture.forked import Forked
 from torture.kills import (
     HALT,
     IN_TIME,
@@ -24,7 +25,6 @@ from torture.kills import (
     recorded_bytes,
     until,
 )
-from torture.forked import Forked
 from torture.starvation import Starvation
 
 _OUTLIVES = 0.5

@@ -7,7 +7,6 @@ where it happens. A program that waits, sleeps or computes for too long gains no
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -42,7 +41,6 @@ class Starvation:
         found: dict[str, int] = {}
         for pid in self._pids:
             with contextlib.suppress(OSError):
-                for thread in os.listdir(f"/proc/{pid}/task"):
-                    words = Path(f"/proc/{pid}/task/{thread}/schedstat").read_text().split()
-                    found[thread] = int(words[1])
+                for thread in Path(f"/proc/{pid}/task").iterdir():
+                    found[thread.name] = int((thread / "schedstat").read_text().split()[1])
         return found

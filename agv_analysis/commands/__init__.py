@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -121,6 +122,8 @@ def needs_ros(otherwise: str = "") -> Iterator[None]:
     `otherwise` goes to its end: what works without ROS.
     """
     try:
+        if importlib.util.find_spec("rclpy") is None:  # a runner of processes does not import it itself
+            raise ImportError("No module named 'rclpy'")
         yield
     except ImportError as error:
         raise click.ClickException(

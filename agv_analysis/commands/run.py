@@ -90,9 +90,12 @@ def command(
         _run_fleet(scenario, fleet, pitch, bag, processes, (fsync, if_unwritable))
         return
     with needs_ros():
-        from agv_analysis.runtime.processes import run_in_processes
         from agv_analysis.runtime.run_setup import OnDisk
-        from agv_analysis.runtime.runner import run_in_process
+
+        if processes:
+            from agv_analysis.runtime.processes import run_in_processes
+        else:  # the nodes, and rclpy, are imported here only if they run here
+            from agv_analysis.runtime.runner import run_in_process
     from agv_analysis.commands.progress import step_bar
     from agv_ros.discovery import discovery_note
 
@@ -137,14 +140,17 @@ def _run_fleet(
 
     fleet = dict(zip(vehicle_names(count), vehicle_scenarios(scenario, count, pitch), strict=True))
     with needs_ros():
-        from agv_analysis.runtime.processes import run_fleet_in_processes
         from agv_analysis.runtime.run_setup import OnDisk
-        from agv_analysis.runtime.runner import run_fleet
+
+        if processes:
+            from agv_analysis.runtime.processes import run_fleet_in_processes as run
+        else:
+            from agv_analysis.runtime.runner import run_fleet as run
     if bag is not None:
         with new_directory(bag):
             pass  # each vehicle's recorder goes on in it
     with step_bar(count * scenario.plant.duration / scenario.plant.ts) as progress:
-        outcomes = (run_fleet_in_processes if processes else run_fleet)(fleet, bag, progress, OnDisk(*disk))
+        outcomes = run(fleet, bag, progress, OnDisk(*disk))
     ended = dict(zip(fleet, outcomes, strict=True))
     rate = sum(outcome.rate for outcome in outcomes)
     click.echo(

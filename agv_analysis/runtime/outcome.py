@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+
+Progress = Callable[[int], None]
+"""Called with the number of steps done, every now and then."""
 
 
 @dataclass(frozen=True)

@@ -20,17 +20,15 @@ from typing import Any
 import click
 
 from agv_analysis.runtime.executables import NODE_MODULES
-from agv_analysis.runtime.outcome import Outcome
+from agv_analysis.runtime.outcome import Outcome, Progress
 from agv_analysis.runtime.run_setup import AS_USUAL, OnDisk, params_file, recording_of, scenario_that_waits
-from agv_analysis.runtime.runner import Progress, run_fleet
 from agv_analysis.runtime.shared_memory import leftovers, remove
 from agv_analysis.runtime.speedometer import Speedometer
 from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
-from agv_plant.plant_node import progress_line, progress_of
+from agv_plant.progress_line import progress_line, progress_of
 from agv_ros.errors import UserError
-from agv_ros.executor import ENDS_WITH_STDIN, Stop, stop_on_signals
-from agv_ros.node import STOPPED_BY
 from agv_ros.parameters import as_dict
+from agv_ros.stopping import ENDS_WITH_STDIN, STOPPED_BY, Stop, stop_on_signals
 
 _STOP_TIMEOUT = 20.0
 """How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
@@ -125,7 +123,12 @@ def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None
 
 def _clean_up(processes: Iterable[_Process]) -> None:
     """Remove what processes that were killed had in shared memory: later runs could hang on it."""
-    if any(process.killed_by for process in processes):
+    if not any(process.killed_by for process in processes):
+        return
+    remove(leftovers(settled=_SETTLED), _SETTLED)
+    # Who still sent to a node that was killed may have made its port anew, a moment ago.
+    if any(one.mine for one in leftovers(settled=0.0)):
+        time.sleep(_SETTLED)
         remove(leftovers(settled=_SETTLED), _SETTLED)
 
 
@@ -165,6 +168,8 @@ def _outcome_of(vehicle: _Process, stopped: bool) -> Outcome:
 
 def _drive_vehicle(name: str, params: str, bag: str, on_disk: str) -> None:
     """Body of a vehicle's process: its progress goes to standard output and, as the last line, its Outcome."""
+    from agv_analysis.runtime.runner import run_fleet  # nodes and rclpy, which a process that starts others needs not
+
     scenario = load_scenario(params)
     steps, last_report = scenario.plant.duration / scenario.plant.ts, time.monotonic()
 

@@ -14,7 +14,7 @@ from rclpy.executors import Executor
 
 from agv_analysis.runtime.edge_inputs import EdgeInputs
 from agv_analysis.runtime.one_process import OneProcess
-from agv_analysis.runtime.outcome import Outcome
+from agv_analysis.runtime.outcome import Outcome, Progress
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_analysis.runtime.replay_node import Pace, ReplayNode, ReplayRecorder
 from agv_analysis.runtime.run_setup import AS_USUAL, PATIENCE, OnDisk, params_file, recording_of, scenario_that_waits
@@ -25,10 +25,11 @@ from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
 from agv_plant.relay_node import RelayNode
-from agv_ros.executor import EXECUTORS, Stop, add, spin, spin_for, stop_on_signals
+from agv_ros.executor import EXECUTORS, add, spin, spin_for
 from agv_ros.messages import Command, TrackingError
 from agv_ros.node import LoopNode
 from agv_ros.parameters import LoopParameters
+from agv_ros.stopping import Stop, stop_on_signals
 
 NODES: dict[str, Callable[..., LoopNode[Any]]] = {
     "plant": PlantNode,
@@ -44,9 +45,6 @@ _WATCHED = {topic.strip("/") for topic in TOPICS}
 
 _PATIENCE_WITH_WATCHER, _LOOK_PERIOD = 5.0, 0.01
 """How long a run waits for its watcher, and how often it looks [s]."""
-
-Progress = Callable[[int], None]
-"""Called with the number of steps done, every now and then."""
 
 
 def run_in_process(

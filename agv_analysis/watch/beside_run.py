@@ -13,6 +13,7 @@ from pathlib import Path
 
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
+from agv_ros.stopping import ENDS_WITH_STDIN
 
 SERVED, STOP = "watch: ", "stop"
 """What the watcher prints: before the page's address, and when its button stop is pressed."""
@@ -35,8 +36,6 @@ def watcher_beside(
 
     The page's button stop sends this process SIGINT. Raises UserError if the watcher cannot start.
     """
-    from agv_ros.executor import ENDS_WITH_STDIN  # which needs ROS
-
     relay = scenario.relay
     sides = (("--plant-domain", relay.plant_domain_id), ("--edge-domain", relay.edge_domain_id))
     domains = [word for option, domain in sides if domain >= 0 for word in (option, str(domain))]

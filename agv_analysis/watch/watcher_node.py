@@ -31,8 +31,8 @@ from agv_analysis.watch.watch_page import served
 from agv_analysis.watch.watch_session import TICK, WatchSession
 from agv_ros.endpoints import WATCHER
 from agv_ros.errors import UserError
-from agv_ros.executor import stop_on_signals
 from agv_ros.node import ENDED
+from agv_ros.stopping import stop_on_signals
 
 _QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 

@@ -27,8 +27,9 @@ from agv_analysis.runtime.runner import loop_of, run_fleet, run_loops
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.stability.driven_commands import driven_commands
 from agv_cloud.controller_node import ControllerNode
-from agv_ros.executor import EXECUTORS, spin_for, stop_on_signals
+from agv_ros.executor import EXECUTORS, spin_for
 from agv_ros.params_file import parse_sections
+from agv_ros.stopping import stop_on_signals
 
 if TYPE_CHECKING:
     from test.conftest import Drive
