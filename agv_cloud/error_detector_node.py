@@ -26,6 +26,7 @@ from agv_cloud.reference.thinned_path import path_points, thinned
 from agv_cloud.slot_stepping import SlotStepping
 from agv_cloud.step import EdgeStep
 from agv_cloud.timer_stepping import OutsideRunError, TimerStepping
+from agv_ros.clock_mode import hear_clock_mode, window_of
 from agv_ros.codec import (
     decode_command,
     decode_slot,
@@ -104,6 +105,10 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
             # First the slots: a relay waits for a subscriber of the poses, and then has that of the slots, too.
             self.input(TimeReference, "edge/slot", self._on_slot, *feeds)
             self.input(kind, "edge/pose", self._on_pose, *feeds)
+            hear_clock_mode(self, "edge", self._on_clock_mode)
+
+    def _on_clock_mode(self, mode: str) -> None:
+        self._slots.limit_window(window_of(mode, self.settings.window_steps))
 
     def on_settings(self) -> None:
         """Parameters that were changed while the node runs."""

@@ -46,6 +46,10 @@ class SlotStepping:
         """Step of a stamp. Raises OffGridError for one that is no sampling instant of the run."""
         return self._steps.of(stamp_ns)
 
+    def limit_window(self, steps: int) -> None:
+        """From now on a stamp may be this many steps after the newest one."""
+        self._steps.window = steps
+
     def add_pose(self, pose: StampedPose) -> None:
         """Take a pose."""
         self._ready.extend(self._sync.add_message(pose))

@@ -25,6 +25,7 @@ from agv_plant.random_stream import normals_of
 from agv_plant.vehicle.motion import NOISE, SLIP, Motion, measured, move, vehicle_parameters, vehicle_step
 from agv_plant.vehicle.registry import VEHICLES
 from agv_plant.zero_order_hold import ZeroOrderHold
+from agv_ros.clock_mode import LOCKSTEP, ClockMode
 from agv_ros.codec import decode_command, decode_slot, encode_clock, encode_pose, stamp_of
 from agv_ros.endpoints import RECORDER
 from agv_ros.executor import run_node
@@ -79,9 +80,11 @@ class PlantNode(LoopNode[PlantParameters]):
         timeout_ns = to_nanoseconds(settings.cmd_vel_timeout)
         self._held = ZeroOrderHold(timeout_ns, timeout_ns)
         self.deadline_monitor = DeadlineMonitor(self.grid.ts_ns, self.steps)
-        self._lockstep = settings.clock == "lockstep"
+        self._lockstep = settings.clock == LOCKSTEP
         self._pose_out = self.output(PoseStamped, "agv/pose")
         self._clock_out = self.output(Clock, "/clock", side=True)
+        self._mode_out = ClockMode(self, "agv")
+        self._mode_out.say(settings.clock)
         self._truth_out = self.output(PoseStamped, "agv/ground_truth", side=True) if settings.is_noisy else None
         self._transforms = TransformBroadcaster(self, FRAME_AGV)
         self._plans: dict[int, tuple[tuple[float, float], ...]] = {}

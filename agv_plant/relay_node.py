@@ -18,6 +18,7 @@ from agv_plant.parameters import RelayParameters
 from agv_plant.radio.channel import Channel
 from agv_plant.radio.link import Link, Passage
 from agv_ros.codec import decode_command, encode_slot, encode_twist, pose_decoder, stamp_of
+from agv_ros.clock_mode import ClockMode, hear_clock_mode, window_of
 from agv_ros.endpoints import Output
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST
@@ -51,6 +52,8 @@ class RelayNode(LoopNode[RelayParameters]):
         self._agv_slot = self.output(TimeReference, "agv/slot", optional=True, on=self._agv)
         self.input(pose_kind, "agv/pose", self._on_pose, self._edge_pose, self._edge_slot, on=self._agv)
         self.input(kind, f"edge/{self._command}", self._on_command, self._agv_cmd_vel, self._agv_slot, on=self._edge)
+        self._mode_out = ClockMode(self._edge, "edge")
+        hear_clock_mode(self._agv, "agv", self._on_clock_mode)
         if self._agv is not self._edge:
             self.create_timer(_LOOK_PERIOD, self._look_for_ways_around, clock=self._steady)
 
@@ -66,6 +69,12 @@ class RelayNode(LoopNode[RelayParameters]):
                     f"{topic} comes into domain {side.context.get_domain_id()} around the relay: "
                     "this run would not show the effect of the channel; stop whatever else publishes it there"
                 )
+
+    def _on_clock_mode(self, mode: str) -> None:
+        """The AGV says which clock the loop has; the edge is to know it, too."""
+        for link in (self.uplink, self.downlink):
+            link.limit_window(window_of(mode, self.settings.window_steps))
+        self._mode_out.say(mode)
 
     def _on_pose(self, data: bytes) -> None:
         if self._agv is not self._edge and not self.uplink.sent:

@@ -71,7 +71,7 @@ class Steps:
     """
 
     def __init__(self, grid: Grid, window: int = MAX_LEAP) -> None:
-        self._grid, self._window = grid, window
+        self._grid, self.window = grid, window
         self._last: int | None = None
         self._beyond = 0
         """Step of the last stamp that was refused, and how many in a row agree with each other."""
@@ -80,7 +80,7 @@ class Steps:
     def of(self, stamp_ns: int) -> int:
         """Step of a stamp. Raises OffGridError for no sampling instant, or one too far after the newest one."""
         k = self._grid.step(stamp_ns)
-        latest = MAX_FIRST if self._last is None else self._last + self._window
+        latest = MAX_FIRST if self._last is None else self._last + self.window
         if k > latest and not self._agrees(k):
             raise OffGridError(
                 f"stamp {stamp_ns / NS_PER_S:.9f} s is step {k}, the furthest one seen was {self._last}; "
@@ -92,7 +92,7 @@ class Steps:
 
     def _agrees(self, k: int) -> bool:
         """Has the loop leapt to step k, as enough messages in a row say?"""
-        follows = self._agreeing > 0 and 0 < k - self._beyond <= self._window
+        follows = self._agreeing > 0 and 0 < k - self._beyond <= self.window
         self._agreeing, self._beyond = self._agreeing + 1 if follows else 1, k
         return self._last is not None and self._agreeing >= AGREEING and k <= self._last + MAX_FIRST
 

@@ -21,7 +21,7 @@ from fuzz.__main__ import add
 from fuzz.campaign import Result
 from fuzz.campaign import run as fuzz
 from torture.by_hand import faults_by_hand, run_by_hand
-from torture.forked import import_all
+from torture.forked import end_with_parent, import_all
 from torture.kills import IN_TIME, Case, faults, in_fair_order, run
 from torture.wire import Attacked, attack
 
@@ -81,6 +81,7 @@ def _line(name: str, part: dict[str, Any]) -> str:
 
 def _start_worker(domains: multiprocessing.Queue[int]) -> None:
     """First thing in a worker: a DDS domain of its own; Ctrl-C is the first process' to handle."""
+    end_with_parent()
     os.environ["ROS_DOMAIN_ID"] = str(domains.get())
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

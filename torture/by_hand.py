@@ -15,6 +15,7 @@ from torture.forked import Forked
 from torture.kills import (
     HALT,
     IN_TIME,
+    LAG,
     NODES,
     SHARE,
     STEPS,
@@ -43,6 +44,8 @@ class EndedByHand(NamedTuple):
     """From the request to the end of those that were left after the plant, and then of the recorder; the longer one."""
     starved: float
     """For how long [s], of these times, nodes waited for a processor."""
+    lag: float
+    """The same shortly before the signal."""
     early: tuple[str, ...]
     """Nodes, neither plant nor the one that got the signal, that had ended before they were asked to."""
     orphans: tuple[str, ...]
@@ -76,12 +79,14 @@ def _arguments(node: str, case: Case, folder: Path, params: str) -> Iterator[str
 
 def _hurt(case: Case, folder: Path, begun: dict[str, Forked]) -> EndedByHand:
     plant, victim = begun["plant"], begun[case.node]
-    share = SHARE[case.moment]
+    share, pids = SHARE[case.moment], [process.pid for process in begun.values()]
+    before = Starvation(pids)
     if share is None:
         until(victim, lambda: "[INFO]" in victim.said())
     else:
-        until(plant, lambda: recorded_bytes(folder / "bag") > share * STEPS[case.clock])
-    sent, starvation = time.monotonic(), Starvation(process.pid for process in begun.values())
+        until(plant, lambda: recorded_bytes(folder / "bag") > share * STEPS[case.clock], watched=before)
+    lag = before.in_the_last(LAG)
+    sent, starvation = time.monotonic(), Starvation(pids)
     victim.send_signal(case.number)
     if case.number == signal.SIGSTOP:
         time.sleep(HALT)
@@ -107,7 +112,7 @@ def _hurt(case: Case, folder: Path, begun: dict[str, Forked]) -> EndedByHand:
     return EndedByHand(
         {node: process.returncode for node, process in begun.items() if process.returncode is not None},
         {node: process.said() for node, process in begun.items()},
-        victim_seconds, seconds, starvation.seconds, early, orphans,
+        victim_seconds, seconds, starvation.seconds, lag, early, orphans,
     )  # fmt: skip
 
 
@@ -120,7 +125,7 @@ def faults_by_hand(case: Case, ended: EndedByHand, bag: Path) -> list[str]:
             found.append(f"{whose} ended after {seconds:.1f} s, {ended.starved:.1f} s of it without a processor")
     found += [f"{node} said a traceback" for node, said in ended.said.items() if "Traceback" in said]
     found += [wrong for node, status in ended.statuses.items() if (wrong := _wrong_status(case, node, status, ended))]
-    return found + lost_steps(case, "\n".join(ended.said.values()), bag)
+    return found + lost_steps(case, "\n".join(ended.said.values()), bag, ended.lag)
 
 
 def _wrong_status(case: Case, node: str, status: int, ended: EndedByHand) -> str:

@@ -7,6 +7,7 @@ nodes that a runner starts are programs from their beginning to their end.
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import signal
@@ -16,6 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from agv_analysis.runtime.executables import NODE_MODULES
+
+_PR_SET_PDEATHSIG = 1
+"""Of prctl(2)."""
 
 
 def import_all() -> None:
@@ -61,11 +65,20 @@ class Forked:
             self.returncode = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
 
 
+def end_with_parent() -> None:
+    """Have Linux kill this process when the one that forked it ends, however that ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+
+
 def _run(main: Callable[[], object], log: Path) -> None:
     """Body of the new process, which never returns."""
     status = 1
     try:
+        end_with_parent()
         _connect(log)
+        for number in (signal.SIGHUP, signal.SIGTERM):  # `nohup` has them ignored, which a process inherits
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         main()
         status = 0
     except SystemExit as ended:

@@ -34,6 +34,9 @@ IN_TIME = 5.0
 MOST_LOST = {"lockstep": 1000, "realtime": 40 + 20}
 """Steps that may be lost with a recorder that is killed: in real time 0.2 s, and what was on its way to it."""
 
+LAG = 2.0
+"""How long [s] before the signal a lack of processors may be why the recorder is behind."""
+
 HALT = 2.0
 """How long [s] SIGSTOP halts a process."""
 
@@ -72,6 +75,8 @@ class Ended(NamedTuple):
     """From the signal to the end."""
     starved: float
     """How much of it [s] processes of the run waited for a processor."""
+    lag: float
+    """How much they did [s] shortly before the signal: so much of a loop in real time can be on its way to a disk."""
     orphans: tuple[str, ...]
     """Processes of the run that outlived it."""
     left: tuple[Path, ...]
@@ -120,14 +125,15 @@ def run(case: Case, folder: Path, params: str) -> Ended:
     try:
         until(runner, lambda: len(_children(runner.pid)) == len(NODES) - 1)
         family = _children(runner.pid)
-        share = SHARE[case.moment]
+        share, before = SHARE[case.moment], Starvation(family.values())
         if share is not None:
-            until(runner, lambda: recorded_bytes(folder / "bag") > share * steps)
+            until(runner, lambda: recorded_bytes(folder / "bag") > share * steps, watched=before)
+        lag = before.in_the_last(LAG)
         victim = runner.pid if case.node == "runner" else family.get(case.node)
         held = [] if victim is None else held_by(victim)
         if runner.poll() is None:  # else the run has ended before: what it said is judged
             _send(victim, case.number)
-        return _ended(runner, family, held)
+        return _ended(runner, family, held, lag)
     finally:
         runner.kill()
         for pid in family.values():
@@ -144,7 +150,7 @@ def _send(pid: int | None, number: signal.Signals) -> None:
                 os.kill(pid, signal.SIGCONT)
 
 
-def _ended(runner: Forked, family: dict[str, int], held: list[Path]) -> Ended:
+def _ended(runner: Forked, family: dict[str, int], held: list[Path], lag: float) -> Ended:
     """Wait for the end of a run and of all of its processes."""
     begun, starvation = time.monotonic(), Starvation((runner.pid, *family.values()))
     until(runner, lambda: False, watched=starvation)
@@ -154,7 +160,8 @@ def _ended(runner: Forked, family: dict[str, int], held: list[Path]) -> Ended:
     orphans = tuple(n for n, pid in family.items() if _runs(pid))
     status = runner.poll()
     said = runner.said() + ("" if status is not None else "it does not end")
-    return Ended(99 if status is None else status, said, seconds, starvation.seconds, orphans, tuple(sorted(left)))
+    starved = starvation.seconds
+    return Ended(99 if status is None else status, said, seconds, starved, lag, orphans, tuple(sorted(left)))
 
 
 def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
@@ -166,17 +173,18 @@ def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
         found.append(f"ended after {ended.seconds:.1f} s, {ended.starved:.1f} s of it without a processor")
     if "Traceback" in ended.said:
         found.append("said a traceback")
-    return found + _wrong_status(case, ended) + lost_steps(case, ended.said, bag)
+    return found + _wrong_status(case, ended) + lost_steps(case, ended.said, bag, ended.lag)
 
 
-def lost_steps(case: Case, said: str, bag: Path) -> list[str]:
+def lost_steps(case: Case, said: str, bag: Path, lag: float) -> list[str]:
     """What is missing from the recording and should not be, by what the nodes said; empty if nothing is."""
     found = []
     recorded, missing = _in_bag(bag)
     if recorded is None and case.moment != "start":
         found.append("left a bag that cannot be read")
     reached = re.search(r"after step (\d+)", said)
-    if reached and recorded is not None and recorded < int(reached[1]) - MOST_LOST[case.clock]:
+    most = MOST_LOST[case.clock] + (lag / TS if case.clock == "realtime" else 0.0)
+    if reached and recorded is not None and recorded < int(reached[1]) - most:
         found.append(f"left {recorded} of {reached[1]} steps in the bag")
     if case.clock == "lockstep" and case.number != signal.SIGKILL and missing:
         found.append(f"lost {missing}")

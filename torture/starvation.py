@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
 _PERIOD = 0.05
 """How often [s] it is looked, at most."""
+
+_KEPT = round(10.0 / _PERIOD)
 
 
 class Starvation:
@@ -24,6 +27,7 @@ class Starvation:
         self._at = time.monotonic()
         self.seconds = 0.0
         """For how long so far one of them at least had to wait; at most what has passed."""
+        self._spans: deque[tuple[float, float]] = deque(maxlen=_KEPT)
 
     def look(self) -> None:
         """Add what they have waited since the last look; to be called again and again."""
@@ -33,8 +37,15 @@ class Starvation:
         waited = self._read()
         # A thread that is new has waited since its beginning, which may be before the last look; it counts from now on.
         longest = max((ns - self._waited.get(thread, ns) for thread, ns in waited.items()), default=0)
-        self.seconds += min(longest / 1e9, now - self._at)
+        spent = min(longest / 1e9, now - self._at)
+        self.seconds += spent
+        self._spans.append((now, spent))
         self._waited, self._at = waited, now
+
+    def in_the_last(self, seconds: float) -> float:
+        """The same of the last `seconds` before now; of 10 s at most."""
+        since = time.monotonic() - seconds
+        return sum(spent for at, spent in self._spans if at > since)
 
     def _read(self) -> dict[str, int]:
         """Nanoseconds on a run queue by thread; none of processes that have ended."""

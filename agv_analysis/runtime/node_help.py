@@ -23,22 +23,24 @@ _SLOT, _POSE, _COMMAND = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/TwistStamped",
 )
+_CLOCK_MODE = "clock_mode diagnostic_msgs/msg/KeyValue"
 _ERROR, _DIAGNOSTICS = "nav_msgs/msg/Odometry", "/diagnostics diagnostic_msgs/msg/DiagnosticArray"
 
 ABOUT = {
     "plant": About(
         "The AGV: publishes its pose, executes the commands that arrive, and keeps the loop's clock.",
         (f"agv/cmd_vel {_COMMAND}", f"agv/slot {_SLOT}"),
-        (f"agv/pose {_POSE}", "/clock rosgraph_msgs/msg/Clock", _DIAGNOSTICS),
+        (f"agv/pose {_POSE}", f"agv/{_CLOCK_MODE}", "/clock rosgraph_msgs/msg/Clock", _DIAGNOSTICS),
     ),
     "relay": About(
         "The radio link between the AGV and the edge: forwards, delays or loses each message, reproducibly.",
-        (f"agv/pose {_POSE}", f"edge/cmd_vel {_COMMAND}"),
-        (f"edge/pose {_POSE}", f"edge/slot {_SLOT}", f"agv/cmd_vel {_COMMAND}", f"agv/slot {_SLOT}", _DIAGNOSTICS),
+        (f"agv/pose {_POSE}", f"agv/{_CLOCK_MODE}", f"edge/cmd_vel {_COMMAND}"),
+        (f"edge/pose {_POSE}", f"edge/slot {_SLOT}", f"edge/{_CLOCK_MODE}", f"agv/cmd_vel {_COMMAND}",
+         f"agv/slot {_SLOT}", _DIAGNOSTICS),
     ),
     "error_detector": About(
         "At the edge: compares the reference with the freshest pose that has come.",
-        (f"edge/pose {_POSE}", f"edge/slot {_SLOT}"),
+        (f"edge/pose {_POSE}", f"edge/slot {_SLOT}", f"edge/{_CLOCK_MODE}"),
         (f"edge/error {_ERROR}", "edge/reference nav_msgs/msg/Path", _DIAGNOSTICS),
     ),
     "controller": About(

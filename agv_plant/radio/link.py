@@ -40,6 +40,11 @@ class Link(LinkCounts):
         self._under_way: list[tuple[int, float, int, int, bytes]] = []
         self._order = 0
 
+    def limit_window(self, steps: int) -> None:
+        """From now on a stamp on the grid may be this many steps after the newest one."""
+        if isinstance(self._steps, Steps):
+            self._steps.window = steps
+
     def transmit(self, stamp_ns: int, message: bytes = b"", place: tuple[float, float] = NOWHERE) -> Passage:
         """The slot of the message with this stamp, sent when the AGV is at `place` [m].
 
