@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-STEPS = 12
+STEPS = 6
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "zstd": {"compression": CompressionType.ZSTD},

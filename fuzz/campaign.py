@@ -26,7 +26,7 @@ from fuzz.truth import NotReadableError, payloads_by_sqlite, rows_by_mcap, rows_
 SLOW_S = 5.0
 """A case that takes more of the processor's time is a fault: the bags have some ten kilobytes."""
 
-MEMORY = 2**31
+MEMORY = 2**30
 """Bytes that a process may ask for beyond what it has."""
 
 _MOST_SAVED = 50

@@ -178,8 +178,8 @@ def faults(case: Case, ended: Ended, bag: Path) -> list[str]:
 
 def lost_steps(case: Case, said: str, bag: Path, lag: float) -> list[str]:
     """What is missing from the recording and should not be, by what the nodes said; empty if nothing is."""
-    found = []
-    recorded, missing = _in_bag(bag)
+    recorded, missing, raised = _in_bag(bag)
+    found = [raised] if raised else []
     if recorded is None and case.moment != "start":
         found.append("left a bag that cannot be read")
     reached = re.search(r"after step (\d+)", said)
@@ -203,13 +203,15 @@ def _wrong_status(case: Case, ended: Ended) -> list[str]:
     return [] if case.node == "runner" or case.node in ended.said else [f"does not name the {case.node}"]
 
 
-def _in_bag(bag: Path) -> tuple[int | None, dict[str, int]]:
-    """Steps in a recording, and messages that are missing from it."""
+def _in_bag(bag: Path) -> tuple[int | None, dict[str, int], str]:
+    """Steps in a recording, messages that are missing from it, and what went wrong that should not when it was read."""
     try:
         found = read_run(bag)
     except UserError:
-        return None, {}
-    return int(found.k[-1]) + 1, dict(found.unexplained)
+        return None, {}, ""
+    except Exception as error:
+        return None, {}, f"reading the bag raises {type(error).__name__}: {error}"
+    return int(found.k[-1]) + 1, dict(found.unexplained), ""
 
 
 def until(

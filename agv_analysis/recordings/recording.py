@@ -148,9 +148,9 @@ def _run(bag: Bag, names: dict[str, str], said: Said, source: str) -> Run:
     ages = topics.get("edge/age", NOTHING)
     if len(ages.k):  # the edge stepped by its own clock, and says itself what it held
         n_ul = slot_outcomes(ages, k, scenario.grid)[0]
-    downlink = topics.get("agv/slot")
+    downlink = topics.get("agv/slot", NOTHING)
     n_dl, downlink_lost, of_downlink = (
-        (None, np.zeros_like(lost), None) if downlink is None else slot_outcomes(downlink, k, scenario.grid)
+        slot_outcomes(downlink, k, scenario.grid) if len(downlink.k) else (None, np.zeros_like(lost), None)
     )
     sent = postures(poses, "pose", k, scenario.plant.initial_pose[2])
     true = topics.get("agv/ground_truth", NOTHING)

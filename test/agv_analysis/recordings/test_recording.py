@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from agv_analysis.metrics.convergence import wrapped
-from agv_analysis.recordings.recording import read_run
+from agv_analysis.recordings.recording import TOPICS, read_run
 from agv_analysis.scenario import load_scenario
 from agv_ros.codec import decode_slot, encode_slot
 from agv_ros.errors import UserError
@@ -242,3 +242,13 @@ def test_a_recording_that_lost_many_messages_has_the_sampling_period_that_it_had
     lost = set(np.random.default_rng(1).choice(2000, 600, replace=False).tolist())
     run = read_run(changed_bag(tmp_path / "bag.mcap", lambda _, k, data: [] if k in lost else [data]))
     assert run.unexplained["agv/pose"] > 500
+
+
+@pytest.mark.parametrize("topic", [topic for topic in TOPICS if topic not in ("agv/pose", "edge/slot")])
+def test_a_topic_that_is_there_without_any_message_is_nothing_known(tmp_path: Path, topic: str) -> None:
+    """So is the beginning of a run whose recorder was killed."""
+    whole = read_run(SAMPLE)
+    run = read_run(changed_bag(tmp_path / "bag.mcap", lambda name, _, data: [] if name == f"/{topic}" else [data]))
+    assert len(run) == len(whole)
+    assert not run.downlink_lost.any()
+    np.testing.assert_array_equal(run.lost, whole.lost)
