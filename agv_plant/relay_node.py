@@ -17,8 +17,8 @@ from agv_plant.channels.position_dependent import NOWHERE
 from agv_plant.parameters import RelayParameters
 from agv_plant.radio.channel import Channel
 from agv_plant.radio.link import Link, Passage
-from agv_ros.codec import decode_command, encode_slot, encode_twist, pose_decoder, stamp_of
 from agv_ros.clock_mode import ClockMode, hear_clock_mode, window_of
+from agv_ros.codec import decode_command, encode_slot, encode_twist, pose_decoder, stamp_of
 from agv_ros.endpoints import Output
 from agv_ros.executor import run_node
 from agv_ros.message_types import ODOMETRY, TWIST

@@ -24,6 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from agv_ros.discovery import discovery_note
 from agv_ros.errors import UserError, open_text
 from agv_ros.node import LoopNode
+from agv_ros.service_manager import ALIVE, READY, STOPPING, notify, watchdog_period
 from agv_ros.stopping import ENDS_WITH_STDIN, Stop, stop_on_signals
 
 EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "single": SingleThreadedExecutor}
@@ -137,7 +138,11 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     node.announce()
     executor = EventsExecutor()
     add(executor, node)
+    if (period := watchdog_period()) is not None:  # by the executor, so that a callback that hangs is noticed
+        node.every(period, lambda: notify(ALIVE))
+    notify(READY)
     spin(executor, lambda: node.finished or stop.requested)
+    notify(STOPPING)
     if not node.finished:
         node.on_stop(stop.reason or "the end of its context")
     deadline = time.monotonic() + (node.settings.stop_timeout if stop.requested else LAST_FLUSH_TIMEOUT)

