@@ -14,7 +14,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test coverage bench fuzz torture dist lowest pythons docs images sample clean
+.PHONY: demo test coverage bench growth fuzz torture dist lowest pythons docs images sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -32,8 +32,11 @@ test: $(VENV)/test.stamp ## style, types, prose and tests
 coverage: PYTEST_ARGS += --cov --cov-report=term ## the same with coverage, which takes longer
 coverage: test
 
-bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run
-	$(BIN)/python -m benchmarks $(BENCH)
+bench: $(VENV)/test.stamp ## speed, as ratios to peers measured in the same run; JSON=FILE keeps it, AGAINST=FILE compares
+	$(BIN)/python -m benchmarks $(BENCH) $(if $(JSON),--json $(JSON)) $(if $(AGAINST),--against $(AGAINST))
+
+growth: $(VENV)/test.stamp ## cost and memory against steps, vehicles, seeds, states and size of bags: docs/performance.md
+	$(BIN)/python -m benchmarks.growth
 
 fuzz: $(VENV)/test.stamp ## damaged bags against independent readers, a million over night; CASES=1000 for fewer
 	nice $(BIN)/python -m fuzz --cases $(or $(CASES),1000000) --json fuzz.json --save fuzz_failures

@@ -1,4 +1,4 @@
-"""Measure and print: `python -m benchmarks [SUBJECT ...] [--json FILE]`.
+"""Measure and print: `python -m benchmarks [SUBJECT ...] [--json FILE] [--against FILE]`.
 
 Each subject is a module with a function `measure() -> list[Comparison]`. An aim that is missed is shown, and does not
 fail the command: how fast a machine is at a given moment is no property of the code.
@@ -7,7 +7,6 @@ fail the command: how fast a machine is at a given moment is no property of the 
 from __future__ import annotations
 
 import importlib
-import json
 import pkgutil
 from pathlib import Path
 
@@ -17,27 +16,44 @@ from rich.table import Table
 
 import benchmarks
 from benchmarks.comparison import Comparison
+from benchmarks.record import changes, read_record, write_record
 
-NOT_SUBJECTS = ("__main__", "comparison", "echo")
+NOT_SUBJECTS = ("__main__", "comparison", "echo", "growth", "record")
 SUBJECTS = sorted(
     module.name for module in pkgutil.iter_modules(benchmarks.__path__) if module.name not in NOT_SUBJECTS
 )
+
+ROUNDS = 3
+"""How often each subject is measured where its noise has to be known."""
 
 
 @click.command()
 @click.argument("subjects", nargs=-1, type=click.Choice(SUBJECTS))
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write the figures to this file, too.")
-def main(subjects: tuple[str, ...], json_file: Path | None) -> None:
+@click.option(
+    "--against", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="Compare with a file of --json."
+)
+@click.option(
+    "--rounds", type=click.IntRange(1), help=f"Measure so often: {ROUNDS} for --json and --against, otherwise once."
+)
+def main(subjects: tuple[str, ...], json_file: Path | None, against: Path | None, rounds: int | None) -> None:
     """Measure the SUBJECTS, all of them by default, each against its peers."""
     console = Console(highlight=False)
-    found: dict[str, list[Comparison]] = {}
-    for subject in subjects or SUBJECTS:
-        with console.status(f"measuring {subject} ..."):
-            found[subject] = importlib.import_module(f"benchmarks.{subject}").measure()
-        console.print(_table(subject, found[subject]))
+    before = None if against is None else read_record(against)
+    times = rounds or (ROUNDS if json_file or against else 1)
+    found: dict[str, list[list[Comparison]]] = {}
+    chosen = subjects or (SUBJECTS if before is None else [one for one in SUBJECTS if one in before["subjects"]])
+    for subject in chosen:
+        for number in range(times):
+            with console.status(f"measuring {subject}, round {number + 1} of {times} ..."):
+                rows = importlib.import_module(f"benchmarks.{subject}").measure()
+            found.setdefault(subject, []).append(rows)
+            console.print(_table(subject, rows))
     if json_file is not None:
-        content = {subject: [{**row._asdict(), "ratio": row.ratio} for row in rows] for subject, rows in found.items()}
-        json_file.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_record(json_file, found)
+    if before is not None:
+        for line in changes(before, found):
+            console.print(line, markup=False, soft_wrap=True)
 
 
 def _table(subject: str, rows: list[Comparison]) -> Table:
