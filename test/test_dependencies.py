@@ -33,7 +33,7 @@ ROOMS = {
     "explore": ("agv_analysis/explore/", "agv_analysis/watch/"),
     "cluster": ("agv_analysis/sweep/execute.py",),
     "parquet": ("agv_analysis/sweep/rows_file.py", "agv_analysis/bags/export.py"),
-    "captures": ("agv_analysis/link/formats/capture.py",),
+    "captures": ("agv_analysis/link/formats/capture_packets.py",),
     "irtt": ("agv_analysis/link/formats/irtt_json.py",),
 }
 """Where the packages of each extra may be imported."""

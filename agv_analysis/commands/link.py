@@ -193,7 +193,7 @@ def _driven(console: Console, scenario: Scenario, found: LinkFigures, link: Any)
     with tempfile.TemporaryDirectory() as folder, _busy("driving the loop through the link ..."):
         driven = through_trace(scenario, link, Path(folder) / "link.csv")
         alone = through_trace(scenario, without_delays(link), Path(folder) / "losses.csv") if has_delays else None
-        fitted = through_channel(fitted_scenario(scenario, found.fitted.fit, link, found.measured.interval))
+        fitted = through_channel(fitted_scenario(scenario, link, found.measured.interval))
     _print_driven(console, "through this very link", driven)
     content = driven.to_json()
     if alone is not None:
@@ -225,6 +225,8 @@ def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
     far = f"up to {largest:.3g} m from its reference" if np.isfinite(largest) else "without bound"
     median = "" if count == 1 else f", the median run up to {float(np.median(driven.deviations)):.3g} m"
     console.print(f"  Deviation in {runs}: {far}{median}", soft_wrap=True)
+    if driven.judged is not None:
+        console.print(f"  Judged by the first {driven.judged:g} s of the measurement", soft_wrap=True)
     if driven.corridor:
         leaves = driven.leaves
         console.print(

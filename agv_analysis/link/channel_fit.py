@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from agv_analysis.link.goodness_of_fit import Goodness, goodness_of_fit
-from agv_analysis.link.large_arrays import count_of
+from agv_analysis.link.large_arrays import column_of, count_of, parts
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.resampling import age_and_loss_samples
@@ -97,7 +97,8 @@ def fit_channel(lost: Outcomes, k: Steps | None = None) -> ChannelFit:
 
     They are those of the slots `k`, increasing; without `k` none is missing.
     """
-    k = np.arange(len(lost)) if k is None else k
+    if k is None:
+        k = column_of((np.arange(part.start, part.stop) for part in parts(len(lost))), np.int64)
     found, goodness = count_transitions(k, lost), goodness_of_fit(k, lost)
     ages, rates = age_and_loss_samples(k, lost) if not goodness.fits else (None, None)
     share = count_of(lost, lambda part: part) / len(lost)

@@ -112,6 +112,62 @@ def taken(array: NDArray[Any], places: NDArray[np.int64]) -> NDArray[Any]:
     return found
 
 
+def reordered_by(array: NDArray[Any], places: NDArray[np.int64]) -> NDArray[Any]:
+    """The values at some places of an array, in whatever order, shape (n,); quick where neighbours mostly stay so."""
+    return column_of((array[places[part]] for part in parts(len(places), array, places)), array.dtype)
+
+
+def is_increasing(array: NDArray[Any]) -> bool:
+    """Is no value less than the one before it?"""
+    return not any(
+        np.any(array[part.start + 1 : part.stop + 1] < array[part]) for part in parts(len(array) - 1, array)
+    )  # fmt: skip
+
+
+def places_in_order(array: NDArray[Any]) -> NDArray[np.int64]:
+    """The places of the values of an array in their order, equal ones in that of the array; none is NaN; shape (n,).
+
+    Of a large array those values are sorted together that lie between two of a sample's.
+    """
+    count = len(array)
+    if count <= _TOGETHER:
+        return np.argsort(array, kind="stable")
+    sample = np.sort(np.concatenate([array[part][::_SAMPLED] for part in parts(count, array)]))
+    bounds = np.unique(sample[:: _TOGETHER // _SAMPLED][1:])
+    found = Column(np.int64)
+    for i in range(len(bounds) + 1):
+        at = places_of(array, lambda part, i=i: np.searchsorted(bounds, part, side="right") == i)  # type: ignore[misc]
+        found.extend(at[np.argsort(taken(array, at), kind="stable")])
+    return found.values
+
+
+def firsts_in_order(numbers: NDArray[Any]) -> NDArray[np.int64] | None:
+    """The places of different numbers in order, of equal ones the first, shape (n,); None: they are so already."""
+    if all(
+        np.all(numbers[part.start + 1 : part.stop + 1] > numbers[part]) for part in parts(len(numbers) - 1, numbers)
+    ):
+        return None
+    order = places_in_order(numbers)
+    ordered = reordered_by(numbers, order)
+    fresh = (
+        order[part][
+            np.append(part.start == 0 or ordered[part.start - 1] != ordered[part.start], np.diff(ordered[part]) > 0)
+        ]
+        for part in parts(len(order), order, ordered)
+    )
+    return column_of(fresh, np.int64)
+
+
+def places_of(array: NDArray[Any], holds: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> NDArray[np.int64]:
+    """The places of those values of an array of which something holds, increasing, shape (n,)."""
+    at = (part.start + np.flatnonzero(holds(array[part])) for part in parts(len(array), array))
+    return column_of(at, np.int64)
+
+
+_TOGETHER, _SAMPLED = 1 << 20, 1 << 6
+"""Values that are sorted together, about, and of how many one is looked at to find where to part them."""
+
+
 def all_of(array: NDArray[Any], holds: Callable[[NDArray[Any]], NDArray[np.bool_]]) -> bool:
     """Does something hold of all values of an array?"""
     return all(bool(holds(array[part]).all()) for part in parts(len(array), array))
@@ -164,6 +220,16 @@ def sizes_and_counts(values: Callable[[], Iterable[Floats]]) -> tuple[Floats, ND
         counts += np.bincount((_sorting_as_floats(part) >> shift).astype(np.int64), minlength=len(counts))
     found = np.flatnonzero(counts)
     return _as_floats(found.astype(np.uint64) << shift), counts[found]
+
+
+def median_step(times: Floats) -> float:
+    """Median of the differences of neighbours, shape (n,), n >= 2."""
+    count = len(times) - 1
+
+    def steps() -> Iterator[Floats]:
+        return (np.diff(times[part.start : part.stop + 1]) for part in parts(count, times))
+
+    return sum(order_statistics(steps, [(count - 1) // 2, count // 2])) / 2.0
 
 
 _SIGN = np.uint64(1 << 63)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.link.large_arrays import all_of, column_of, count_of, is_all_nan, parts, release
-from agv_analysis.link.measurement import LOST, RECEIVED, Measurement, PacketOutcomes
+from agv_analysis.link.large_arrays import Column, column_of, count_of, is_all_nan, parts, release
+from agv_analysis.link.measurement import LOST, NOT_SENT, RECEIVED, UNKNOWN, Measurement, PacketOutcomes
 from agv_analysis.output_file import output_file
 from agv_analysis.run import Floats
 from agv_plant.channels.timed_trace import read_trace
@@ -45,26 +45,18 @@ def link_of_loop(measured: Measurement, rtt: str = UP) -> LinkOfLoop:
     The client of the measurement is taken for the AGV. What is not known of a packet is what was known before it.
     """
     up, down, both = measured.uplink, measured.downlink, measured.round_trip
-    notes: list[str] = []
+    delays, notes = (_delay(up), _delay(down)), list[str]()
     is_told = up is not None and up.is_told and (down is None or down.is_told)
-    if is_told or both is None:
-        up_lost = None if up is None else _held(up)
-        down_lost = None if down is None else _held(down)
-        delays = _delay(up), _delay(down)
-        if up is None or down is None:
-            notes.append(
-                f"nothing is known of the {'uplink' if up is None else 'downlink'}, which is taken for perfect"
-            )
-    else:
-        lost = _held(both)
-        nothing = np.zeros(len(lost), dtype=np.bool_)
-        up_lost, down_lost = (nothing, lost) if rtt == DOWN else (lost, nothing)
-        delays = _delay(up), _delay(down)
-        said = "its losses are taken for the " + ("downlink's" if rtt == DOWN else "uplink's")
+    if not is_told and both is not None:
+        up, down, said = _both_ways(up, down, both, rtt)
         if delays[0] is None or delays[1] is None:
             delays, share = _shares(both, rtt)
             said += f", {share}"
-        notes.append(f"only the round trip is known: {said} (--rtt {rtt})")
+        notes.append(f"{said} (--rtt {rtt})")
+    elif up is None or down is None:
+        notes.append(f"nothing is known of the {'uplink' if up is None else 'downlink'}, which is taken for perfect")
+    up_lost = np.zeros(measured.packets, dtype=np.bool_) if up is None else _held(up)
+    down_lost = None if down is None else _held(down)
     found, early = [], 0
     for delay in delays:
         below = 0 if delay is None else count_of(delay, lambda part: part < 0.0)
@@ -72,10 +64,53 @@ def link_of_loop(measured: Measurement, rtt: str = UP) -> LinkOfLoop:
         found.append(_mapped(delay, lambda part: np.maximum(part, 0.0)) if below and delay is not None else delay)
     if early:
         notes.append(f"{early} delays are below 0, since the clocks do not agree: they count as 0")
-    nothing = np.zeros(measured.packets, dtype=np.bool_)
-    return LinkOfLoop(
-        _increasing(measured.sent), nothing if up_lost is None else up_lost, found[0], down_lost, found[1], tuple(notes)
-    )
+    return LinkOfLoop(_increasing(measured.sent), up_lost, found[0], down_lost, found[1], tuple(notes))
+
+
+def _both_ways(
+    up: PacketOutcomes | None, down: PacketOutcomes | None, both: PacketOutcomes, rtt: str
+) -> tuple[PacketOutcomes, PacketOutcomes, str]:
+    """Outcomes of either way where not all are known, and that in words: what is known of a packet stays.
+
+    A packet of which only the round trip is known to be lost was lost on the way that `rtt` says.
+    """
+    ups, downs = Column(np.int8), Column(np.int8)
+    assumed = known_up = known_down = 0
+    arrays = (both.outcome, None if up is None else up.outcome, None if down is None else down.outcome)
+    for part in parts(len(both.outcome), *arrays):
+        whole = both.outcome[part]
+        going, coming = (
+            np.where(whole == RECEIVED, RECEIVED, UNKNOWN if array is None else array[part]).astype(np.int8)
+            for array in arrays[1:]
+        )
+        blind = (whole == LOST) & (going != LOST) & (coming != LOST)
+        known_up += int(np.count_nonzero(going == LOST))
+        known_down += int(np.count_nonzero(coming == LOST))
+        assumed += int(np.count_nonzero(blind))
+        going[blind], coming[blind] = (RECEIVED, LOST) if rtt == DOWN else (LOST, NOT_SENT)
+        ups.extend(going)
+        downs.extend(coming)
+    way = "downlink's" if rtt == DOWN else "uplink's"
+    said = f"only the round trip is known: its losses are taken for the {way}"
+    if known_up or known_down:
+        said = (
+            f"{assumed} losses on a way that is not known are taken for the {way}, beside {known_up} that are known to "
+            f"be the uplink's and {known_down} the downlink's"
+        )
+    return PacketOutcomes(ups.values), PacketOutcomes(downs.values), said
+
+
+def beginning_of(link: LinkOfLoop, seconds: float) -> LinkOfLoop:
+    """The packets of the first so many seconds."""
+    end = int(np.searchsorted(link.time, seconds))
+
+    def upto(values: Any) -> Any:
+        return values if values is None else values[:end]
+
+    return link._replace(
+        time=link.time[:end], uplink_lost=link.uplink_lost[:end], uplink_delay=upto(link.uplink_delay),
+        downlink_lost=upto(link.downlink_lost), downlink_delay=upto(link.downlink_delay),
+    )  # fmt: skip
 
 
 def _delay(packets: PacketOutcomes | None) -> Floats | None:
@@ -101,12 +136,17 @@ def _shares(both: PacketOutcomes, rtt: str) -> tuple[tuple[Floats | None, Floats
 
 def _held(packets: PacketOutcomes) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Lost or not, shape (N,); where that is not known, what it was before, received at the beginning."""
-    known = packets.known
-    if all_of(known, lambda part: part):
-        return packets.lost
-    last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
-    outcome = np.where(last >= 0, packets.outcome[np.maximum(last, 0)], RECEIVED)
-    return np.asarray(outcome == LOST)
+    outcome = packets.outcome
+
+    def lost() -> Iterator[np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+        before = np.array([RECEIVED], dtype=np.int8)
+        for part in parts(len(outcome), outcome):
+            codes = np.append(before, outcome[part])
+            last = np.maximum.accumulate(np.where(codes <= LOST, np.arange(len(codes)), 0))
+            before = codes[last[-1:]]
+            yield codes[last][1:] == LOST
+
+    return column_of(lost(), np.bool_)
 
 
 def _increasing(sent: Floats) -> Floats:

@@ -6,14 +6,13 @@ packets were lost in each interval, and no more; a `Setting` is no measurement b
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.link.large_arrays import column_of, count_of, order_statistics, parts
+from agv_analysis.link.large_arrays import column_of, count_of, median_step, parts
 from agv_analysis.run import Floats
 from agv_plant.parameters import ChannelParameters
 from agv_ros.errors import UserError
@@ -116,14 +115,7 @@ class Measurement:
     @cached_property
     def interval(self) -> float:
         """Median time between packets sent [s]; 0 for a single one."""
-        if self.packets < 2:
-            return 0.0
-        sent, count = self.sent, self.packets - 1
-
-        def steps() -> Iterator[Floats]:
-            return (np.diff(sent[part.start : part.stop + 1]) for part in parts(count, sent))
-
-        return sum(order_statistics(steps, [(count - 1) // 2, count // 2])) / 2.0
+        return 0.0 if self.packets < 2 else median_step(self.sent)
 
     @property
     def whole(self) -> PacketOutcomes:

@@ -193,6 +193,21 @@ def count_on(times: Floats) -> None:
         newest = times[part.stop - 1]
 
 
+def spread_equal(times: Floats) -> int:
+    """In place: of equal times [s], which increase from the first to the last, those behind the first one are spread.
+
+    They are put evenly before the next time; returns how many they are.
+    """
+    count, before = 0, np.full(1, np.nan)
+    for part in parts(len(times), times):
+        now = np.append(before, times[part])
+        is_equal = np.diff(now) == 0.0
+        before, count = now[-1:], count + int(np.count_nonzero(is_equal))
+        times[part][is_equal] = np.nan
+    interpolate(times)
+    return count
+
+
 def next_known(times: Floats, first: int) -> int:
     """The first place from `first` on that has a number; there must be one."""
     for part in parts(len(times) - first, times):

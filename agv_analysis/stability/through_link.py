@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.link.channel_fit import ChannelFit, Estimate
-from agv_analysis.link.measured_trace import LinkOfLoop, write_trace
+from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
+from agv_analysis.link.large_arrays import count_of, median_step, parts
+from agv_analysis.link.link_figures import Spread
+from agv_analysis.link.measured_trace import LinkOfLoop, beginning_of, write_trace
+from agv_analysis.link.reception_intervals import Outcomes
 from agv_analysis.metrics.outages import outage_lengths
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
@@ -26,9 +29,10 @@ from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.delay import whole_slots
 
 _MOST_STEPS = 20_000
-"""Steps of the run that is driven through a measured link, its beginning; the criteria judge all its outcomes."""
+"""Steps of the run that is driven through a measured link, its beginning; the criteria judge _MOST_SLOTS."""
 
 _MOST_SLOTS = 4_000_000
+"""Slots of a measured link that are judged, from its beginning: what comes behind them is not kept in memory."""
 
 _WINDOWS = 20
 """Most runs whose deviations are listed."""
@@ -49,6 +53,8 @@ class ThroughLink:
     """The longest uplink outage [slots]."""
     corridor: float = 0.0
     """Half-width of the corridor about the reference [m]; 0: there is none."""
+    judged: float | None = None
+    """How much of the measurement, from its beginning, is judged [s]; None: all of it."""
 
     @property
     def left(self) -> int:
@@ -71,6 +77,7 @@ class ThroughLink:
             "runs": len(self.deviations),
             "run_s": self.seconds,
             "outage_max_slots": self.longest_slots,
+            "judged_s": self.judged,
             "corridor": self._corridor_to_json(),
         }
 
@@ -102,21 +109,24 @@ def without_delays(link: LinkOfLoop) -> LinkOfLoop:
     )
 
 
-def fitted_scenario(scenario: Scenario, fit: ChannelFit, link: LinkOfLoop, interval: float) -> Scenario:
-    """A scenario whose uplink is the channel that was fitted, in its own slots, and delays as their median.
+def fitted_scenario(scenario: Scenario, link: LinkOfLoop, interval: float) -> Scenario:
+    """A scenario whose links are the channels that fit the losses of each way, and delays as their median.
 
     A Gilbert channel fitted to packets every `interval` [s] is one of the loop's slots with outages and gaps as long.
     """
-    ts = scenario.plant.ts
-    plain = ChannelParameters()
-    up = replace(plain, **_in_slots(fit, interval / ts)) if fit.loss_rate.value > 0.0 else plain
-    delays = [
-        0.0 if delay is None else float(np.nanmedian(delay)) for delay in (link.uplink_delay, link.downlink_delay)
-    ]
-    relay = replace(
-        scenario.relay, uplink=replace(up, delay=delays[0]), downlink=replace(plain, delay=delays[1])
-    )  # fmt: skip
-    return replace(scenario, relay=relay)
+    slots = interval / scenario.plant.ts
+    uplink = _fitted(link.uplink_lost, link.uplink_delay, slots)
+    downlink = _fitted(link.downlink_lost, link.downlink_delay, slots)
+    return replace(scenario, relay=replace(scenario.relay, uplink=uplink, downlink=downlink))
+
+
+def _fitted(lost: Outcomes | None, delay: Floats | None, slots: float) -> ChannelParameters:
+    """The channel that fits the outcomes of packets which are so many `slots` apart, None of one that is perfect."""
+    late = None if delay is None else Spread.of(lambda: (delay[part] for part in parts(len(delay), delay)))
+    found = ChannelParameters(delay=0.0 if late is None else late.percentiles[0])
+    if lost is None or not count_of(lost, lambda part: part):
+        return found
+    return replace(found, **_in_slots(fit_channel(lost), slots))
 
 
 def _in_slots(fit: ChannelFit, slots: float) -> dict[str, Any]:
@@ -138,13 +148,13 @@ def through_trace(scenario: Scenario, link: LinkOfLoop, file: Path) -> ThroughLi
     """
     ended = with_an_end(scenario)
     ts = scenario.plant.ts
-    span = float(link.time[-1]) + (float(np.median(np.diff(link.time))) if len(link.time) > 1 else ts)
+    span = float(link.time[-1]) + (median_step(link.time) if len(link.time) > 1 else ts)
     seconds = min(span, ended.plant.duration, _MOST_STEPS * ts)
     seconds = max(1, round(seconds / ts)) * ts
     windows = max(1, min(_WINDOWS, int(span / seconds + 1e-9)))
-    found = traced(with_duration(ended, seconds), link, file)
-    uplink = found.relay.uplink
     slots = min(_MOST_SLOTS, max(1, whole_slots(span / ts)))
+    found = traced(with_duration(ended, seconds), beginning_of(link, slots * ts), file)
+    uplink = found.relay.uplink
     lost = ChannelRealisation(1, slots, ts).outcomes(uplink, "uplink")
     lengths = outage_lengths(np.arange(slots), lost)
     longest = int(lengths.max(initial=0))
@@ -158,7 +168,10 @@ def through_trace(scenario: Scenario, link: LinkOfLoop, file: Path) -> ThroughLi
         )  # fmt: skip
     corridor = scenario.error_detector.corridor
     deviations = deviations_of(found, windows)
-    return ThroughLink(decide(evidence), evidence.confidence, deviations, seconds, longest, corridor)
+    return ThroughLink(
+        decide(evidence), evidence.confidence, deviations, seconds, longest, corridor,
+        judged=slots * ts if slots == _MOST_SLOTS else None,
+    )  # fmt: skip
 
 
 def through_channel(scenario: Scenario, seeds: int = _WINDOWS) -> ThroughLink:

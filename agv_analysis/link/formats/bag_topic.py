@@ -7,6 +7,7 @@ stamp to the log. Without stamps only the log times are known: a gap of more tha
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -39,20 +40,25 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    progress = options.progress
-    try:
-        bag = read_bag(path, progress=None if progress is None else lambda percent: progress(percent / 100.0))
-    except BagError as error:
-        raise MeasurementError(str(error)) from None
-    slots = [topic for name in _SLOTS for topic in bag.topics if topic.strip("/").endswith(name)]
+    held = _read_bag(path, (), options)
+    slots = [topic for name in _SLOTS for topic in held.topics if topic.strip("/").endswith(name)]
     if not options.topic and slots:
-        return _of_slots(bag, slots)
-    topics = [topic for topic in bag.topics if topic.strip("/") == options.topic.strip("/")]
+        return _of_slots(_read_bag(path, slots, options), slots)
+    topics = [topic for topic in held.topics if topic.strip("/") == options.topic.strip("/")]
     if not topics:
-        known = ", ".join(f"{name} ({topic.count})" for name, topic in sorted(bag.topics.items()))
+        known = ", ".join(f"{name} ({topic.count})" for name, topic in sorted(held.topics.items()))
         asked = f"has no topic {options.topic}" if options.topic else "is a recording: name a topic with --topic"
         raise MeasurementError(f"{path}: {asked}; it has {known}")
-    return measure_topic(bag, topics[0], options.interval)
+    return measure_topic(_read_bag(path, topics, options), topics[0], options.interval)
+
+
+def _read_bag(path: Path, topics: Collection[str], options: Options) -> Bag:
+    """A bag with the messages of some topics. Raises MeasurementError."""
+    progress = options.progress
+    try:
+        return read_bag(path, topics, progress=None if progress is None else lambda percent: progress(percent / 100.0))
+    except BagError as error:
+        raise MeasurementError(str(error)) from None
 
 
 def _stamps(rows: NDArray[np.void], name: str = "header.stamp") -> Times | None:

@@ -1,8 +1,9 @@
 """A table with a header: a trace of ours, an export of tshark, or any CSV with columns called as below.
 
     time                 when a packet was sent [s], or a date of ISO 8601 with a time
-    seq                  its number; a number that no row has was lost
-    sent, received       when it was sent and when it arrived; lost where `received` is empty
+    seq                  its number; in a table of what was received one that no row has was lost
+    sent, received       when it was sent and when it arrived; lost where `received` is empty, or, if it never is and
+                         there are numbers, where a number is missing
     lost, received       0/1, true/false, yes/no, or a word: lost, delivered, received, ok
     delay, rtt           one way, there and back again [s]; lost where both are empty and nothing else says it
     uplink_lost, downlink_lost, uplink_delay, downlink_delay       the same of each direction; lost is nan where nothing
@@ -10,11 +11,13 @@
 
 A name may end with its unit, as in `rtt_ms` or `RTT [ms]`; tshark's own names are known, and options name any others.
 The separator is a comma, a semicolon, a tabulator or a bar, whichever splits the header into most names; where it is no
-comma, a comma is a decimal mark. Lines that begin with # are comments.
+comma, a comma is a decimal mark. Lines that begin with # are comments. A date without a unit that would be later than
+the year 5000 in seconds is one in ms, us or ns, which is said.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -22,32 +25,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.link.formats.format import Format, Options
-from agv_analysis.link.formats.rows import floats_at
-from agv_analysis.link.formats.table_cells import dates_at, flags_at, is_date, trimmed
-from agv_analysis.link.formats.table_header import (
-    FLAGS,
-    INSTANTS,
-    ROLES,
-    Header,
-    TableColumn,
-    columns_of,
-    header_of,
-    is_enough,
+from agv_analysis.link.formats.table_header import FLAGS, columns_of, header_of, is_enough
+from agv_analysis.link.formats.table_rows import TableRows
+from agv_analysis.link.formats.text_columns import blocks
+from agv_analysis.link.large_arrays import (
+    Column,
+    all_of,
+    column_of,
+    count_of,
+    forget,
+    is_increasing,
+    median_step,
+    parts,
+    places_in_order,
+    reordered_by,
 )
-from agv_analysis.link.formats.text_columns import Block, Bytes, Places, blocks, head_of
-from agv_analysis.link.large_arrays import Column, all_of, column_of, count_of, forget, parts
 from agv_analysis.link.measurement import (
     LOST,
     NOT_SENT,
     RECEIVED,
     UNKNOWN,
-    Malformed,
     Measurement,
-    MeasurementError,
     PacketOutcomes,
     needs_packets,
 )
-from agv_analysis.link.packet_grid import CountedOn, PacketGrid
+from agv_analysis.link.packet_grid import CountedOn, PacketGrid, spread_equal
 from agv_analysis.run import Floats
 
 _DIRECTIONS = ("uplink_lost", "downlink_lost")
@@ -56,85 +58,13 @@ _ALWAYS_FLAGS = ("lost", *_DIRECTIONS)
 _EMPTY = 2
 """Of a flag: no cell says it."""
 
-Part = dict[str, NDArray[np.float64]]
-"""Columns of a block by role, of the rows that were understood; NaN where a cell is empty."""
-
 
 def _matches(head: bytes, path: Path) -> bool:
     return is_enough({column.role for column in columns_of(header_of(head))})
 
 
-class _Rows:
-    """Reads the rows of a table, block by block."""
-
-    def __init__(self, path: Path, options: Options) -> None:
-        self.header: Header = header_of(head_of(path))
-        self.columns = columns_of(self.header, options.columns, str(path))
-        self.roles = {column.role for column in self.columns}
-        self.malformed = Malformed()
-        self.has_commas = False
-        """Was a comma where it may be a decimal mark?"""
-        self._dated: dict[str, bool] = {}
-        if not is_enough(self.roles):
-            raise MeasurementError(
-                f"{path}: no column says which packets were lost; it has {', '.join(self.header.names)}: name one with "
-                f"--column, as in --column lost=NAME; roles are {', '.join(ROLES)}"
-            )
-
-    def part(self, block: Block) -> Part:
-        """The columns of a block's rows."""
-        text, count = block.text, len(self.header.names)
-        ends_of_cells = np.flatnonzero((text == ord(self.header.separator)) | (text == ord("\n")))
-        lines = block.line_of(ends_of_cells)
-        is_row = np.bincount(lines, minlength=len(block.starts)) == count
-        is_row[: max(0, self.header.line + 1 - block.number)] = False
-        is_row &= text[block.starts] != ord("#")
-        rows = np.flatnonzero(is_row)
-        ends = ends_of_cells[is_row[lines]].reshape(-1, count)
-        begins = np.concatenate((block.starts[rows][:, None], ends[:, :-1] + 1), axis=1)
-        if self.header.may_have_commas and not self.has_commas:
-            self.has_commas = bool((text == ord(",")).any())
-        good, found = np.ones(len(rows), dtype=np.bool_), {}
-        for column in self.columns:
-            cells = trimmed(text, begins[:, column.place], ends[:, column.place])
-            found[column.role], fine = self._values(text, *cells, column)
-            good &= fine
-        is_row[rows[~good]] = False
-        for i in np.flatnonzero(~is_row).tolist():
-            line = block.line(i)
-            if block.number + i > self.header.line and line.strip() and not line.startswith(b"#"):
-                self.malformed.add(block.number + i, line)
-        return {role: values[good] for role, values in found.items()}
-
-    def _values(
-        self, text: Bytes, begins: Places, ends: Places, column: TableColumn
-    ) -> tuple[Floats, NDArray[np.bool_]]:
-        """The cells of a column as numbers, NaN for an empty one, and which of them are in order."""
-        if column.role in INSTANTS and self._is_dated(text, begins, ends, column.role):
-            values, good = dates_at(text, begins, ends, self.header.may_have_commas)
-            return values, good | (begins == ends)
-        read = flags_at if column.role in FLAGS else floats_at
-        values, good = read(text, begins, ends, self.header.may_have_commas)
-        values *= column.unit
-        return values, good
-
-    def _is_dated(self, text: Bytes, begins: Places, ends: Places, role: str) -> bool:
-        """Does the first cell of a column that holds something hold a date?"""
-        if role not in self._dated:
-            held = np.flatnonzero(begins < ends)[:1]
-            if not len(held):
-                return False
-            self._dated[role] = bool(is_date(text, begins[held], ends[held])[0])
-        return self._dated[role]
-
-    @property
-    def notes(self) -> list[str]:
-        """What was assumed of how cells are written."""
-        return ["commas are taken for decimal marks"] if self.has_commas else []
-
-
 def _read(path: Path, options: Options) -> Measurement:
-    rows = _Rows(path, options)
+    rows = TableRows(path, options)
     if "seq" in rows.roles and not rows.roles & set(FLAGS):
         return _by_number(path, rows, options)
     columns = {column.role: Column(np.int8 if column.role in _ALWAYS_FLAGS else np.float64) for column in rows.columns}
@@ -142,7 +72,18 @@ def _read(path: Path, options: Options) -> Measurement:
         for role, values in rows.part(block).items():
             columns[role].extend(_as_flags(values) if role in _ALWAYS_FLAGS else values)
     needs_packets(len(next(iter(columns.values()))), str(path), "row below its header", rows.malformed)
-    return _measurement(str(path), {role: column.values for role, column in columns.items()}, rows, options)
+    values = {role: column.values for role, column in columns.items()}
+    if _is_of_receiver(values):
+        return _by_arrival(str(path), values, rows, options)
+    return _measurement(str(path), values, rows, options)
+
+
+def _is_of_receiver(values: dict[str, NDArray[Any]]) -> bool:
+    """Are these the packets that arrived, with their numbers and no word on others?"""
+    arrived = values.get("received")
+    if arrived is None or "seq" not in values or values.keys() & set(_ALWAYS_FLAGS):
+        return False
+    return not _are_flags(arrived) and not count_of(arrived, np.isnan)
 
 
 def _as_flags(values: Floats) -> NDArray[np.int8]:
@@ -150,14 +91,16 @@ def _as_flags(values: Floats) -> NDArray[np.int8]:
     return np.asarray(np.where(np.isnan(values), _EMPTY, values != 0.0), dtype=np.int8)
 
 
-def _measurement(source: str, values: dict[str, NDArray[Any]], rows: _Rows, options: Options) -> Measurement:
+def _measurement(source: str, values: dict[str, NDArray[Any]], rows: TableRows, options: Options) -> Measurement:
     notes = rows.notes
     sent, said = _times(values, options)
     notes += [said] if said else []
-    if any(np.any(sent[part.start + 1 : part.stop + 1] < sent[part]) for part in parts(len(sent) - 1, sent)):
-        order = np.argsort(sent, kind="stable")
-        values, sent = {role: column[order] for role, column in values.items()}, sent[order]
+    if not is_increasing(sent):
+        order = places_in_order(sent)
+        values = {role: reordered_by(column, order) for role, column in values.items()}
+        sent = reordered_by(sent, order)
     up, down, whole = _outcomes(values, sent)
+    notes += _spread(sent)
     notes += _missing(values.get("seq"))
     if up is not None and down is None and whole is None:
         notes.append("one direction was measured, and is taken for the uplink")
@@ -260,7 +203,7 @@ def _overtaken(values: dict[str, NDArray[Any]], sent: Floats) -> int:
     return count
 
 
-def _by_number(path: Path, rows: _Rows, options: Options) -> Measurement:
+def _by_number(path: Path, rows: TableRows, options: Options) -> Measurement:
     """Rows are what was received; a number without a row, or in a row without its delay, was lost."""
     delays = [role for role in ("delay", "rtt") if role in rows.roles]
     instant = next((role for role in ("sent", "time") if role in rows.roles), "")
@@ -277,21 +220,57 @@ def _by_number(path: Path, rows: _Rows, options: Options) -> Measurement:
         found.mention(seq[~came])
         sent = part[instant][is_numbered][came] if instant else None
         found.add(seq[came], tuple(column[came] for column in given), sent)
-    needs_packets(found.records, str(path), "row with a number", rows.malformed)
+    return _numbered(str(path), found, delays, rows, options)
+
+
+def _by_arrival(source: str, values: dict[str, NDArray[Any]], rows: TableRows, options: Options) -> Measurement:
+    """Rows are what arrived, and when; a number without a row was lost."""
+    seq, arrived, sent = values["seq"], values["received"], values.get("sent", values.get("time"))
+    found, numbers = PacketGrid(0 if sent is None else 1), CountedOn(may_be_before=False)
+    for part in parts(len(seq), seq, arrived, sent):
+        is_numbered = np.isfinite(seq[part])
+        rows.malformed.count += int(np.count_nonzero(~is_numbered))
+        places, came = numbers.take(seq[part][is_numbered].astype(np.int64)), arrived[part][is_numbered]
+        if sent is None:
+            found.add(places, (), came)
+        else:
+            found.add(places, (came - sent[part][is_numbered],), sent[part][is_numbered])
+    told = _numbered(source, found, [] if sent is None else ["delay"], rows, options)
+    said = (
+        () if sent is not None else ("times are those of arrival, since the table does not say when packets were sent",)
+    )
+    return dataclasses.replace(told, notes=(*told.notes, *said))
+
+
+def _numbered(source: str, found: PacketGrid, delays: list[str], rows: TableRows, options: Options) -> Measurement:
+    needs_packets(found.records, source, "row with a number", rows.malformed)
     notes = [
         *rows.notes, "a number without a row is taken for lost; packets before the first and after the last are unknown"
     ]  # fmt: skip
     if found.dated < 2:
         notes.append(_undated(options))
     grid = found.whole(options.interval or 1.0)
+    if found.dated >= 2:
+        notes += _spread(grid.sent)
     delay = dict(zip(delays, grid.delays, strict=True))
     outcomes = PacketOutcomes(grid.outcome, delay.get("delay", delay.get("rtt")))
     is_round_trip = "rtt" in delay and "delay" not in delay
     return Measurement(
-        source=str(path), format="table", sent=grid.sent, uplink=None if is_round_trip else outcomes,
+        source=source, format="table", sent=grid.sent, uplink=None if is_round_trip else outcomes,
         round_trip=outcomes if is_round_trip else None, duplicates=grid.duplicates, reordered=grid.reordered,
         malformed=rows.malformed, notes=tuple(notes),
     )  # fmt: skip
+
+
+def _spread(sent: Floats) -> list[str]:
+    """Spread packets over stamps that are coarser than packets are apart, in place, and say so."""
+    count = len(sent)
+    if count < 3 or median_step(sent) > 0.0 or not sent[-1] > sent[0]:
+        return []
+    return [
+        f"{spread_equal(sent)} of {count} packets have the time of the one before, and are spread evenly up to the "
+        "next time: durations are as coarse as the stamps"
+    ]
 
 
 FORMAT = Format("table", "table with a header (CSV, tshark, our own traces)", 90, _matches, _read)

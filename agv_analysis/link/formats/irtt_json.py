@@ -24,7 +24,16 @@ from agv_analysis.compiled import HAS_NUMBA
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.irtt_shapes import Shapes, Trip
 from agv_analysis.link.formats.text_columns import Progress, chunks
-from agv_analysis.link.large_arrays import Column, column_of, count_of, forget, is_all_nan, parts
+from agv_analysis.link.large_arrays import (
+    Column,
+    column_of,
+    count_of,
+    firsts_in_order,
+    forget,
+    is_all_nan,
+    parts,
+    reordered_by,
+)
 from agv_analysis.link.measurement import (
     LOST,
     NOT_SENT,
@@ -275,13 +284,17 @@ def _measurement(source: str, table: _Table, malformed: Malformed, stated: float
     seq, word, notes = table.seq.values, table.word.values, []
     delays, stamps = [column.values for column in table.delays], [column.values for column in table.stamps]
     duplicates = reordered = 0
-    if any(np.any(np.diff(seq[part.start : part.stop + 1]) <= 0) for part in parts(len(seq) - 1, seq)):
-        order = np.argsort(seq, kind="stable")
-        reordered = int(np.count_nonzero(np.diff(order) < 0))
-        kept = order[np.append(True, np.diff(seq[order]) > 0)]
-        duplicates = len(order) - len(kept)
-        seq, word = seq[kept], word[kept]
-        delays, stamps = [column[kept] for column in delays], [column[kept] for column in stamps]
+    kept = firsts_in_order(seq)
+    if kept is not None:
+        reordered = sum(
+            int(np.count_nonzero(np.diff(kept[part.start : part.stop + 1]) < 0)) for part in parts(len(kept) - 1, kept)
+        )
+        duplicates = len(seq) - len(kept)
+        seq, word = reordered_by(seq, kept), reordered_by(word, kept)
+        delays, stamps = (
+            [reordered_by(column, kept) for column in delays],
+            [reordered_by(column, kept) for column in stamps],
+        )
     up, down, whole = (
         column_of((codes[word[part]] for part in parts(len(word), word)), np.int8)
         for codes in np.array(list(_WAYS.values()), dtype=np.int8).T

@@ -13,7 +13,7 @@ import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.rows import parts_of_rows
-from agv_analysis.link.large_arrays import Column
+from agv_analysis.link.large_arrays import Column, column_of, is_increasing, parts
 from agv_analysis.link.measurement import (
     RECEIVED,
     Malformed,
@@ -48,22 +48,28 @@ def _read(path: Path, options: Options) -> Measurement:
         found.extend(rows[:, 0])
     at = found.values
     needs_packets(len(at), str(path), "line of an opportunity", malformed)
-    if np.any(np.diff(at) < 0.0) or not at[-1] > 0.0:
+    if not is_increasing(at) or not at[-1] > 0.0:
         raise MeasurementError(f"{path}: times of a mahimahi trace must not decrease, and end behind 0")
     interval = options.interval or _USUAL_INTERVAL
     if at[-1] * _MS / interval > _MOST:
         raise MeasurementError(f"{path}: lasts {at[-1] * _MS:g} s, too long for a packet every {interval:g} s")
     count = max(1, int(np.floor(at[-1] * _MS / interval + 1e-9)))
-    sent = np.arange(count, dtype=np.float64) * interval
-    opportunities = np.append(at, at[0] + at[-1]) * _MS
-    arrives = opportunities[np.searchsorted(opportunities, sent - 1e-9)]
+    again = at[0] + at[-1]
+    sent, delays = Column(), Column()
+    for part in parts(count, at):
+        times = np.arange(part.start, part.stop) * interval
+        place = np.searchsorted(at, (times - 1e-9) / _MS)
+        arrives = np.where(place < len(at), at[np.minimum(place, len(at) - 1)], again) * _MS
+        sent.extend(times)
+        delays.extend(np.maximum(0.0, arrives - times))
+    received = (np.full(part.stop - part.start, RECEIVED) for part in parts(count))
     note = (
         f"opportunities, not packets: one of up to 1500 byte is asked about every {interval:g} s (--interval), which "
         "waits for the next opportunity and is never lost"
     )
     return Measurement(
-        source=str(path), format="mahimahi", sent=sent,
-        uplink=PacketOutcomes(np.full(count, RECEIVED, dtype=np.int8), np.maximum(0.0, arrives - sent)),
+        source=str(path), format="mahimahi", sent=sent.values,
+        uplink=PacketOutcomes(column_of(received, np.int8), delays.values),
         malformed=malformed, notes=(note,),
     )  # fmt: skip
 

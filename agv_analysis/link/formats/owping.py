@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.rows import lines_of_words
 from agv_analysis.link.formats.text_columns import head_of, numbers_at
-from agv_analysis.link.large_arrays import Column, column_of, parts
+from agv_analysis.link.large_arrays import Column, column_of, firsts_in_order, parts, reordered_by
 from agv_analysis.link.measurement import LOST, RECEIVED, Malformed, Measurement, PacketOutcomes, needs_packets
 from agv_analysis.link.packet_grid import count_on
 from agv_analysis.run import Floats
 
 _COLUMNS = (8, 7)
 """Words of a line; older versions have no TTL."""
+
+_STAMP = 18
+"""Digits of a time stamp at least."""
 
 Stamps = NDArray[np.uint64]
 
@@ -34,7 +37,7 @@ def _matches(head: bytes, path: Path) -> bool:
     for line in head.splitlines()[:20]:
         words = line.split()
         if len(words) in _COLUMNS and all(words[i].isdigit() for i in (0, 1, 2, 4, 5)):
-            return len(words[1]) >= 18
+            return len(words[1]) >= _STAMP
     return False
 
 
@@ -45,6 +48,8 @@ def _read(path: Path, options: Options) -> Measurement:
         good = np.ones(len(words.lines), dtype=np.bool_)
         for i, numbers in zip((0, 1, 4), columns, strict=True):
             good &= numbers.length == words.ends[:, i] - words.begins[:, i]
+        good &= columns[1].length >= _STAMP
+        good &= (columns[2].length >= _STAMP) | (columns[2].digits == 0)
         for i in np.flatnonzero(~good).tolist():
             malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
         for column, numbers in zip(found, columns, strict=True):
@@ -67,9 +72,9 @@ def _measurement(source: str, seq: Stamps, sent: Stamps, received: Stamps, malfo
         arrived = np.append(newest, seq[part][received[part] > 0])
         reordered += int(np.count_nonzero(arrived < np.maximum.accumulate(arrived)))
         newest = arrived.max()
-    if any(np.any(seq[part.start + 1 : part.stop + 1] <= seq[part]) for part in parts(count - 1, seq)):
-        _, at = np.unique(seq, return_index=True)
-        seq, sent, received = seq[at], sent[at], received[at]
+    at = firsts_in_order(seq)
+    if at is not None:
+        seq, sent, received = (reordered_by(column, at) for column in (seq, sent, received))
 
     def delays() -> Iterator[Floats]:
         for part in parts(len(seq), sent, received):

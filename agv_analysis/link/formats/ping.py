@@ -29,10 +29,11 @@ _USUAL_INTERVAL = 1.0
 """Time between packets that ping takes without -i [s]."""
 
 _HEADER = re.compile(rb"PING6?[\s(]")
-_SUMMARY = re.compile(rb"(\d+) packets transmitted(?:.*?\btime (\d+) ?ms)?")
+_SUMMARY = re.compile(rb"(\d+) [^\d,%]+, \d+ .*%[^,]*(?:, \D*(\d+) ?ms)?")
+"""The same in every language: packets sent, received, a percentage, and perhaps the time."""
 _REPLY = re.compile(rb"[:,] (?:icmp_)?seq=\d+ (?:ttl|hlim)=\d+|no answer yet for icmp_seq=\d+")
 _OTHER = re.compile(
-    rb"-+ .* ping6? statistics -+|(rtt|round-trip) .*|\^C|\d+ packets transmitted.*|pipe \d+|ping6?: .*|WARNING: .*"
+    rb"-+ .* -+|(rtt|round-trip) .*|\^C|\d+ packets transmitted.*|pipe \d+|ping6?: .*|WARNING: .*"
     rb"|Request timeout for icmp_seq \d+|\d+/\d+ packets,.*|.*\+\d+ (duplicates|errors|corrupted).*|PATTERN: .*"
     rb"|wrong data byte .*|#\d+\s[0-9a-f ]*"
 )
@@ -68,7 +69,7 @@ def _read(path: Path, options: Options) -> Measurement:
     for block in blocks(path, options.progress):
         _read_block(block, found, path)
     if found.begin is None:
-        only = ": it has the summary alone; run ping without -q" if found.transmitted is not None else ""
+        only = ": it has the summary alone; run ping without -q and -f" if found.transmitted is not None else ""
         raise MeasurementError(f"{path}: has no line of a packet{only}")
     return _measurement(str(path), found, options)
 
@@ -147,7 +148,7 @@ def _read_other(block: Block, i: int, found: _Found, path: Path) -> None:
             raise MeasurementError(f"{path}:{block.number + i}: another run begins: give each run of ping its own file")
         found.has_header = True
         return
-    summary = _SUMMARY.search(line)
+    summary = _SUMMARY.match(line)
     if summary is not None:
         found.transmitted = int(summary[1])
         found.total = None if summary[2] is None else int(summary[2]) * 1e-3

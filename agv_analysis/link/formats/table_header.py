@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -77,7 +78,11 @@ def header_of(head: bytes) -> Header:
 def _header(line: str, number: int) -> Header:
     text = line.strip("\r\n")
     separator = max(_SEPARATORS, key=text.count)
-    return Header(separator, [name.strip().strip("\"'").strip() for name in text.split(separator)], number)
+    try:
+        names = next(csv.reader([text], delimiter=separator, skipinitialspace=True), [""])
+    except csv.Error:  # no text
+        names = text.split(separator)
+    return Header(separator, [name.strip().strip("\"'").strip() for name in names], number)
 
 
 def role_of(name: str) -> tuple[str, float]:

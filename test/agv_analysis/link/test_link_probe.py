@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import select
 import shutil
@@ -198,7 +199,48 @@ def lose(host: list[str], kind: int, low: int) -> None:
     on(host, "tc", "filter", "add", "dev", device, "parent", "ffff:", "protocol", "ip", "u32", *match, *away)
 
 
-def probed(hosts: Hosts, path: Path, duration: float) -> Measurement:
+RELAY = """
+import heapq, json, select, socket, sys, time
+drop, late = json.loads(sys.argv[1]), json.loads(sys.argv[2])
+front, back = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+front.bind(("", 47475))
+back.connect(("127.0.0.1", 47474))
+client, queue, count = None, [], 0
+print("ready", flush=True)
+while True:
+    wait = None if not queue else max(0.0, queue[0][0] - time.monotonic())
+    for one in select.select([front, back], [], [], wait)[0]:
+        data, address = one.recvfrom(65536)
+        client = address if one is front else client
+        kind, number = str(data[4]), int.from_bytes(data[21:25], "big")
+        if number in drop.get(kind, ()):
+            continue
+        begin, end, seconds = late.get(kind, (0, 0, 0.0))
+        count += 1
+        at = time.monotonic() + (seconds if begin <= number < end else 0.0)
+        heapq.heappush(queue, (at, count, data, one is front))
+    while queue and queue[0][0] <= time.monotonic():
+        _, _, data, is_up = heapq.heappop(queue)
+        back.send(data) if is_up else front.sendto(data, client)
+"""
+"""Between the cable and the edge's end: drops messages of a kind by their numbers, and delays those of a range."""
+
+
+@contextlib.contextmanager
+def relay_at(host: list[str], drop: dict[int, list[int]], late: dict[int, tuple[int, int, float]]) -> Iterator[None]:
+    relay = subprocess.Popen(
+        [*host, sys.executable, "-c", RELAY, json.dumps(drop), json.dumps(late)], stdout=subprocess.PIPE
+    )
+    try:
+        assert relay.stdout is not None
+        assert relay.stdout.readline() == b"ready\n"
+        yield
+    finally:
+        relay.terminate()
+        relay.communicate()
+
+
+def probed(hosts: Hosts, path: Path, duration: float, port: int = 47474) -> Measurement:
     """What the command measures from one host to the other."""
     agv, edge = hosts
     cli = [sys.executable, "-m", "agv_analysis.cli", "probe"]
@@ -207,7 +249,7 @@ def probed(hosts: Hosts, path: Path, duration: float) -> Measurement:
         assert listener.stdout is not None
         assert b"listening" in listener.stdout.readline()
         words = ("10.213.0.2", "--duration", str(duration), "--interval", "0.002", "--trace", str(path))
-        subprocess.run([*agv, *cli, *words], check=True, capture_output=True)
+        subprocess.run([*agv, *cli, *words, "--port", str(port)], check=True, capture_output=True)
     finally:
         listener.terminate()
         listener.communicate()
@@ -228,6 +270,31 @@ def test_between_two_hosts_what_the_kernel_drops_is_known_exactly(two_hosts: Hos
     figures = LinkFigures(found).to_json()
     assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(3 / 600)
     assert figures["downlink"]["loss_rate"]["value"] == pytest.approx(3 / 597)
+
+
+def test_between_two_hosts_what_a_relay_drops_and_delays_is_known_each_way(two_hosts: Hosts, tmp_path: Path) -> None:
+    """Where the kernel has no netem: losses exactly, and a delay of one way is that way's, and at least as long."""
+    up, down = [3, 4, 5, 6, 250, 599], [10, 11, 340]
+    late = {PACKET: (200, 300, 0.03), ANSWER: (400, 500, 0.02)}
+    with relay_at(two_hosts[1], {PACKET: up, ANSWER: down}, late):
+        found = probed(two_hosts, tmp_path / "link.csv", 1.2, port=47475)
+    assert found.packets == 600
+    assert found.uplink is not None
+    assert found.downlink is not None
+    assert np.flatnonzero(found.uplink.lost).tolist() == up
+    assert np.flatnonzero(found.downlink.lost).tolist() == down
+    figures = LinkFigures(found).to_json()
+    assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(6 / 600)
+    assert figures["uplink"]["outage_max_s"] == pytest.approx(0.008, rel=0.5)
+    assert found.uplink.delay is not None
+    assert found.downlink.delay is not None
+    for delay, other, (begin, end, seconds) in (
+        (found.uplink.delay, found.downlink.delay, late[PACKET]),
+        (found.downlink.delay, found.uplink.delay, late[ANSWER]),
+    ):
+        before = np.nanmedian(delay[20:100])
+        assert np.nanmedian(delay[begin:end]) - before > 0.9 * seconds
+        assert np.nanmedian(other[begin:end]) - np.nanmedian(other[20:100]) < 0.5 * seconds
 
 
 def test_between_two_hosts_with_netem(two_hosts: Hosts, tmp_path: Path) -> None:

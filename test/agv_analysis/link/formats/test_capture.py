@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agv_analysis.link.formats import read_link
-from agv_analysis.link.formats.capture import samples_of
+from agv_analysis.link.formats.capture_packets import samples_of
 from agv_analysis.link.formats.format import Options
 from agv_analysis.link.measurement import Measurement, MeasurementError
 

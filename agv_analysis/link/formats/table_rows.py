@@ -1,0 +1,128 @@
+"""The rows of a table, a block of lines at a time: its columns as numbers, and the lines that are no rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agv_analysis.link.formats.format import Options
+from agv_analysis.link.formats.rows import floats_at
+from agv_analysis.link.formats.table_cells import dates_at, flags_at, is_date, trimmed
+from agv_analysis.link.formats.table_header import (
+    FLAGS,
+    INSTANTS,
+    ROLES,
+    Header,
+    TableColumn,
+    columns_of,
+    header_of,
+    is_enough,
+)
+from agv_analysis.link.formats.text_columns import Block, Bytes, Places, head_of
+from agv_analysis.link.measurement import Malformed, MeasurementError
+from agv_analysis.run import Floats
+
+Part = dict[str, NDArray[np.float64]]
+"""Columns of a block by role, of the rows that were understood; NaN where a cell is empty."""
+
+_DATES = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
+"""From which number on since 1970 it is one of units [s] smaller than a second: 1e11 s are more than 3000 years."""
+
+
+class TableRows:
+    """Reads the rows of a table, block by block."""
+
+    def __init__(self, path: Path, options: Options) -> None:
+        self.header: Header = header_of(head_of(path))
+        self.columns = columns_of(self.header, options.columns, str(path))
+        self.roles = {column.role for column in self.columns}
+        self.malformed = Malformed()
+        self.has_commas = False
+        """Was a comma where it may be a decimal mark?"""
+        self._dated: dict[str, bool] = {}
+        self._units: dict[str, float] = {}
+        if not is_enough(self.roles):
+            raise MeasurementError(
+                f"{path}: no column says which packets were lost; it has {', '.join(self.header.names)}: name one with "
+                f"--column, as in --column lost=NAME; roles are {', '.join(ROLES)}"
+            )
+
+    def part(self, block: Block) -> Part:
+        """The columns of a block's rows."""
+        text, count = block.text, len(self.header.names)
+        ends_of_cells = np.flatnonzero(self._separates(text) | (text == ord("\n")))
+        lines = block.line_of(ends_of_cells)
+        is_row = np.bincount(lines, minlength=len(block.starts)) == count
+        is_row[: max(0, self.header.line + 1 - block.number)] = False
+        is_row &= text[block.starts] != ord("#")
+        rows = np.flatnonzero(is_row)
+        ends = ends_of_cells[is_row[lines]].reshape(-1, count)
+        begins = np.concatenate((block.starts[rows][:, None], ends[:, :-1] + 1), axis=1)
+        if self.header.may_have_commas and not self.has_commas:
+            self.has_commas = bool((text == ord(",")).any())
+        good, found = np.ones(len(rows), dtype=np.bool_), {}
+        for column in self.columns:
+            cells = trimmed(text, begins[:, column.place], ends[:, column.place])
+            found[column.role], fine = self._values(text, *cells, column)
+            good &= fine
+        is_row[rows[~good]] = False
+        for i in np.flatnonzero(~is_row).tolist():
+            line = block.line(i)
+            if block.number + i > self.header.line and line.strip() and not line.startswith(b"#"):
+                self.malformed.add(block.number + i, line)
+        return {role: values[good] for role, values in found.items()}
+
+    def _separates(self, text: Bytes) -> NDArray[np.bool_]:
+        """Which characters are separators, and not between quotation marks?"""
+        found, marks = text == ord(self.header.separator), text == ord('"')
+        if marks.any():
+            upto, ends = np.cumsum(marks), np.flatnonzero(text == ord("\n"))
+            of_lines = np.diff(upto[ends], prepend=0)
+            before = np.repeat(upto[ends] - of_lines, np.diff(ends, prepend=-1))  # marks on the lines above
+            found &= (upto - before) % 2 == 0
+        return found
+
+    def _values(
+        self, text: Bytes, begins: Places, ends: Places, column: TableColumn
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """The cells of a column as numbers, NaN for an empty one, and which of them are in order."""
+        if column.role in INSTANTS and self._is_dated(text, begins, ends, column.role):
+            values, good = dates_at(text, begins, ends, self.header.may_have_commas)
+            return values, good | (begins == ends)
+        read = flags_at if column.role in FLAGS else floats_at
+        values, good = read(text, begins, ends, self.header.may_have_commas)
+        values *= self._unit(column, values)
+        return values, good
+
+    def _unit(self, column: TableColumn, values: Floats) -> float:
+        """What a number of a column is worth [s]: what its name says, else what makes a date of its first one."""
+        if column.unit != 1.0 or column.role not in INSTANTS:
+            return column.unit
+        if column.role not in self._units:
+            held = values[np.isfinite(values)][:1]
+            if not len(held):
+                return column.unit
+            self._units[column.role] = next((unit for least, unit in _DATES if held[0] >= least), 1.0)
+        return self._units[column.role]
+
+    def _is_dated(self, text: Bytes, begins: Places, ends: Places, role: str) -> bool:
+        """Does the first cell of a column that holds something hold a date?"""
+        if role not in self._dated:
+            held = np.flatnonzero(begins < ends)[:1]
+            if not len(held):
+                return False
+            self._dated[role] = bool(is_date(text, begins[held], ends[held])[0])
+        return self._dated[role]
+
+    @property
+    def notes(self) -> list[str]:
+        """What was assumed of how cells are written."""
+        said = ["commas are taken for decimal marks"] if self.has_commas else []
+        for role, unit in self._units.items():
+            if unit != 1.0:
+                said.append(
+                    f"{role} has no unit, and numbers that are dates in units of {unit:g} s: it is taken for that"
+                )
+        return said
