@@ -15,7 +15,7 @@ from agv_analysis.link.change_points import Stationarity, stationarity
 from agv_analysis.link.channel_fit import ChannelFit, Estimate, fit_channel
 from agv_analysis.link.large_arrays import column_of, count_of, order_statistics, parts, taken
 from agv_analysis.link.markov_channel import chain_of
-from agv_analysis.link.measurement import LOST, LossRates, Measurement, PacketOutcomes, Setting
+from agv_analysis.link.measurement import LOST, UNKNOWN, LossRates, Measurement, PacketOutcomes, Setting
 from agv_analysis.link.reception_intervals import Outcomes, Steps, series_of
 from agv_analysis.link.resampling import weights
 from agv_analysis.metrics.confidence import CONFIDENCE
@@ -111,6 +111,11 @@ class DirectionFigures:
         return count_of(self._packets.outcome, lambda part: part == LOST)
 
     @cached_property
+    def count_unknown(self) -> int:
+        """Packets of which the file does not tell whether they were lost on this way."""
+        return count_of(self._packets.outcome, lambda part: part == UNKNOWN)
+
+    @cached_property
     def fit(self) -> ChannelFit:
         """A channel fitted to the outcomes that are known."""
         return fit_channel(self.lost, self.k)
@@ -184,8 +189,9 @@ class DirectionFigures:
         return {
             "packets": self.count,
             "lost": self.count_lost,
+            "unknown": self.count_unknown,
             "loss_rate": _estimate(self.loss_rate),
-            "outages": len(self.outages),
+            "outages": len(self.outages) if self.is_told else None,
             "outage_max_s": self.longest if self.is_told else None,
             "outage_mean_s": float(self.outages.mean()) if self.is_told and len(self.outages) else None,
             "age": None if self.age is None else self.age.to_json(),
@@ -261,7 +267,18 @@ _KEYS = ("mean_s", *(f"p{q}_s" for q in PERCENTILES), "max_s")
 def _untold() -> dict[str, Any]:
     """Of a direction that the file does not tell."""
     return dict.fromkeys(
-        ("packets", "lost", "loss_rate", "outages", "outage_max_s", "outage_mean_s", "age", "delay", "jitter")
+        (
+            "packets",
+            "lost",
+            "unknown",
+            "loss_rate",
+            "outages",
+            "outage_max_s",
+            "outage_mean_s",
+            "age",
+            "delay",
+            "jitter",
+        )
     )
 
 

@@ -18,6 +18,7 @@ the year 5000 in seconds is one in ms, us or ns, which is said.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +70,8 @@ def _read(path: Path, options: Options) -> Measurement:
         return _by_number(path, rows, options)
     columns = {column.role: Column(np.int8 if column.role in _ALWAYS_FLAGS else np.float64) for column in rows.columns}
     for block in blocks(path, options.progress):
-        for role, values in rows.part(block).items():
-            columns[role].extend(_as_flags(values) if role in _ALWAYS_FLAGS else values)
+        for role, found in rows.part(block).items():
+            columns[role].extend(_as_flags(found) if role in _ALWAYS_FLAGS else found)
     needs_packets(len(next(iter(columns.values()))), str(path), "row below its header", rows.malformed)
     values = {role: column.values for role, column in columns.items()}
     if _is_of_receiver(values):
@@ -242,7 +243,7 @@ def _by_arrival(source: str, values: dict[str, NDArray[Any]], rows: TableRows, o
     return dataclasses.replace(told, notes=(*told.notes, *said))
 
 
-def _numbered(source: str, found: PacketGrid, delays: list[str], rows: TableRows, options: Options) -> Measurement:
+def _numbered(source: str, found: PacketGrid, delays: Sequence[str], rows: TableRows, options: Options) -> Measurement:
     needs_packets(found.records, source, "row with a number", rows.malformed)
     notes = [
         *rows.notes, "a number without a row is taken for lost; packets before the first and after the last are unknown"

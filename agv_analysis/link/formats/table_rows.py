@@ -81,8 +81,8 @@ class TableRows:
             upto, ends = np.cumsum(marks), np.flatnonzero(text == ord("\n"))
             of_lines = np.diff(upto[ends], prepend=0)
             before = np.repeat(upto[ends] - of_lines, np.diff(ends, prepend=-1))  # marks on the lines above
-            found &= (upto - before) % 2 == 0
-        return found
+            found = found & ((upto - before) % 2 == 0)
+        return np.asarray(found)
 
     def _values(
         self, text: Bytes, begins: Places, ends: Places, column: TableColumn

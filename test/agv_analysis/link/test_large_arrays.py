@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 
 from agv_analysis.link import large_arrays
-from agv_analysis.link.large_arrays import Column, column_of, order_statistics, parts, release, sizes_and_counts
+from agv_analysis.link.large_arrays import (
+    Column,
+    column_of,
+    firsts_in_order,
+    median_step,
+    order_statistics,
+    parts,
+    places_in_order,
+    release,
+    sizes_and_counts,
+)
 
 
 def test_a_column_in_a_file_holds_what_one_in_memory_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,3 +75,22 @@ def test_sizes_and_counts_are_those_of_the_values() -> None:
     each, ordered = np.repeat(sizes, counts), np.sort(values)
     assert (each <= ordered).all()
     assert (ordered <= each * (1.0 + 2.0**-8)).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.uint64, np.int64])
+def test_a_large_array_is_sorted_as_a_small_one_is(dtype: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    values = np.concatenate((rng.integers(0, 50, 3000), rng.integers(0, 2**60, 2000), [7] * 400)).astype(dtype)
+    rng.shuffle(values)
+    ordered, firsts = np.argsort(values, kind="stable"), np.unique(values, return_index=True)[1]
+    monkeypatch.setattr(large_arrays, "_TOGETHER", 256)
+    monkeypatch.setattr(large_arrays, "_SAMPLED", 4)
+    np.testing.assert_array_equal(places_in_order(values), ordered)
+    np.testing.assert_array_equal(firsts_in_order(values), firsts)
+    assert firsts_in_order(np.arange(5)) is None
+
+
+def test_the_median_step_is_that_of_all_steps() -> None:
+    for count in (2, 3, 10, 1001):
+        times = np.cumsum(np.random.default_rng(count).exponential(0.02, count))
+        assert median_step(times) == np.median(np.diff(times))

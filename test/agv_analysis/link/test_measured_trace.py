@@ -17,7 +17,9 @@ from agv_analysis.link.measurement import LOST, NOT_SENT, RECEIVED, UNKNOWN, Mea
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
-from agv_analysis.stability.through_link import through_trace, without_delays
+from agv_analysis.stability import through_link
+from agv_analysis.stability.through_link import fitted_scenario, through_trace, without_delays
+from agv_plant.channels.timed_trace import read_trace
 
 REPOSITORY = Path(__file__).parents[3]
 AgvNcs = Callable[..., tuple[int, str]]
@@ -76,6 +78,45 @@ def test_where_a_round_trip_was_lost_is_an_assumption_that_is_said(
     delays = [0.0 if delay is None else float(np.nanmean(delay)) for delay in (link.uplink_delay, link.downlink_delay)]
     assert delays == pytest.approx([0.01 * share for share in shares])
     assert f"--rtt {rtt}" in link.notes[-1]
+
+
+@pytest.mark.parametrize("rtt", ["up", "half", "down"])
+def test_a_loss_on_a_way_that_is_known_stays_there(rtt: str) -> None:
+    """irtt's words false, true_up, true, true_down, true: picture, trace and driven loop take them alike."""
+    up, down = [RECEIVED, LOST, UNKNOWN, RECEIVED, UNKNOWN], [RECEIVED, NOT_SENT, UNKNOWN, LOST, UNKNOWN]
+    codes = (np.array(one, dtype=np.int8) for one in (up, down, [RECEIVED, LOST, LOST, LOST, LOST]))
+    found = Measurement("x", "irtt", 0.02 * np.arange(5.0), *map(PacketOutcomes, codes))
+    figures = LinkFigures(found).to_json()
+    for way in ("uplink", "downlink"):
+        assert (figures[way]["lost"], figures[way]["unknown"]) == (1, 2)
+        assert figures[way]["loss_rate"] is figures[way]["outages"] is figures[way]["outage_max_s"] is None
+    link, blind = link_of_loop(found, rtt), rtt != "down"
+    assert link.uplink_lost.tolist() == [False, True, blind, False, blind]
+    assert link.downlink_lost is not None
+    assert link.downlink_lost.tolist() == [False, False, not blind, True, True]  # not sent: as before
+    assert link.notes == (
+        f"2 losses on a way that is not known are taken for the {'uplink' if blind else 'downlink'}'s, beside 1 that are "
+        f"known to be the uplink's and 1 the downlink's, its delay is not known (--rtt {rtt})",
+    )
+    fitted = fitted_scenario(load_scenario(str(REPOSITORY / "config/outages.yaml")), link, 0.02).relay
+    assert fitted.uplink.model != "perfect"
+    assert fitted.downlink.model != "perfect"
+    one_way = link_of_loop(of_round_trips([0, 1, 0, 0, 1, 0], 0.01), rtt)
+    fitted = fitted_scenario(load_scenario(str(REPOSITORY / "config/outages.yaml")), one_way, 0.02).relay
+    assert (fitted.uplink.model == "perfect", fitted.downlink.model == "perfect") == (not blind, blind)
+
+
+def test_no_more_of_a_long_link_is_kept_than_is_judged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(through_link, "_MOST_SLOTS", 400)
+    monkeypatch.setattr(through_link, "_MOST_STEPS", 100)
+    scenario = load_scenario(str(REPOSITORY / "config/paper.yaml"))
+    losses = np.zeros(1000, dtype=np.int8)
+    losses[50::100] = 1
+    link = link_of_loop(of_round_trips(losses.tolist(), 0.0))
+    found = through_trace(scenario, link, tmp_path / "link.csv")
+    assert found.judged == found.to_json()["judged_s"] == 400 * scenario.plant.ts
+    assert len(read_trace(str(tmp_path / "link.csv"), "uplink").lost) == 100  # 2 s of one packet every 20 ms
+    assert found.longest_slots == 4
 
 
 def test_what_was_never_sent_is_no_loss_of_the_downlink() -> None:

@@ -50,14 +50,18 @@ def outcomes(chain: Chain, slots: int, seed: int) -> np.ndarray[tuple[int], np.d
     return np.asarray(rng.random(slots) >= chain.delivery[state])
 
 
+LOSSES = [(0.01, 1), (0.05, 1), (0.1, 2), (0.2, 1), (0.3, 3), (0.5, 6), (0.6, 4), (0.8, 10)]
+"""Probability, and outages that are survived [slots]."""
+
+GILBERT = [
+    (0.02, 0.2, 0.0, 1.0, 6), (0.01, 0.1, 0.0, 1.0, 10), (0.05, 0.5, 0.0, 1.0, 3), (0.001, 0.05, 0.0, 1.0, 20),
+    (0.2, 0.4, 0.0, 1.0, 4), (0.3, 0.9, 0.0, 1.0, 2), (0.1, 0.3, 0.2, 0.99, 3), (0.01, 0.3, 0.0, 0.995, 2),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("chain", "n"),
-    [
-        (bernoulli(0.2), 1),
-        (bernoulli(0.6), 4),
-        (gilbert_elliott(0.02, 0.2), 6),
-        (gilbert_elliott(0.1, 0.3, 0.2, 0.99), 3),
-    ],
+    [*((bernoulli(p), n) for p, n in LOSSES), *((gilbert_elliott(*channel), n) for *channel, n in GILBERT)],
 )
 def test_slots_counted_one_by_one(chain: Chain, n: int) -> None:
     lost, found = outcomes(chain, 1_000_000, 3), availability_of(chain, n, TS)

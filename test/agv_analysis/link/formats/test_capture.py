@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis.link.formats import read_link
+from agv_analysis.link.formats import capture, read_link
+from agv_analysis.link.formats.capture import arrivals
 from agv_analysis.link.formats.capture_packets import samples_of
 from agv_analysis.link.formats.format import Options
 from agv_analysis.link.measurement import Measurement, MeasurementError
@@ -38,10 +39,12 @@ def info_ts() -> bytes:
     return bytes([0x09, 1]) + struct.pack("<H", 8) + b"\x00" * 8
 
 
-def frame(payload: bytes, port: int = 7411) -> bytes:
-    udp = dpkt.udp.UDP(sport=5000, dport=port, data=payload)
+def frame(payload: bytes, port: int = 7411, back: bool = False) -> bytes:
+    ends = [(b"\x0a\x00\x00\x01", 5000), (b"\x0a\x00\x00\x02", port)]
+    (source, sport), (destination, dport) = ends[::-1] if back else ends
+    udp = dpkt.udp.UDP(sport=sport, dport=dport, data=payload)
     udp.ulen = len(udp)
-    ip = dpkt.ip.IP(src=b"\x0a\x00\x00\x01", dst=b"\x0a\x00\x00\x02", p=dpkt.ip.IP_PROTO_UDP, data=udp)
+    ip = dpkt.ip.IP(src=source, dst=destination, p=dpkt.ip.IP_PROTO_UDP, data=udp)
     return bytes(dpkt.ethernet.Ethernet(src=b"\x01" * 6, dst=b"\x02" * 6, data=ip))
 
 
@@ -117,7 +120,44 @@ def test_a_capture_that_says_nothing_of_losses_is_refused(tmp_path: Path) -> Non
 def test_a_capture_that_was_cut_off_keeps_what_is_whole(tmp_path: Path) -> None:
     path = write(tmp_path / "x.pcap", [(1.0 + i, frame(rtps(i + 1))) for i in range(4)])
     path.write_bytes(path.read_bytes()[:-20])
-    assert measured(path).packets == 3
+    found = measured(path)
+    assert (found.packets, found.malformed.count) == (3, 1)
+    assert "the capture ends within a packet" in found.malformed.shown[0]
+
+
+def test_of_both_directions_the_one_that_is_sent_here_is_the_link(tmp_path: Path) -> None:
+    """Answers, of which none was lost, are not taken for it, whatever the clocks of the two ends say."""
+    for offset in (0.0, -0.5, 0.5):
+        here = [(100.0 + i * INTERVAL, frame(b"%d" % i)) for i in range(N)]
+        there = [(t + DELAY + offset, data) for i, (t, data) in enumerate(here) if i not in LOST]
+        answers = [(100.003 + i * INTERVAL, frame(b"a%d" % i, back=True)) for i in range(N)]
+        here, there = sorted(here + answers), sorted(there + [(t - DELAY + offset, data) for t, data in answers])
+        found = measured(
+            write(tmp_path / "sent.pcap", here), Options(received=write(tmp_path / "received.pcap", there))
+        )  # fmt: skip
+        assert found.uplink is not None
+        assert set(np.flatnonzero(found.uplink.lost).tolist()) == LOST
+        assert found.uplink.delay is not None
+        assert np.nanmedian(found.uplink.delay) == pytest.approx(DELAY + offset, abs=2e-6)
+        assert "the flow back is there, too" in found.notes[1]
+
+
+def test_many_keys_are_matched_as_few_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    sent = rng.integers(0, 2**64, 3000, dtype=np.uint64)
+    sent[rng.integers(0, 3000, 500)] = sent[7]
+    arrived = np.delete(sent, rng.integers(0, 3000, 300))
+    few = arrivals(sent, arrived)
+    assert np.count_nonzero(few < 0) == len(sent) - len(arrived)
+    monkeypatch.setattr(capture, "_MATCHED", 100)
+    np.testing.assert_array_equal(arrivals(sent, arrived), few)
+
+
+def test_a_capture_of_the_other_end_goes_with_a_capture(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("time,lost\n1,0\n2,1\n")
+    with pytest.raises(MeasurementError, match="is no capture .* and --received is a capture of the other end"):
+        read_link(path, Options(received=path))
 
 
 def ip6(payload: bytes) -> bytes:

@@ -71,6 +71,25 @@ def test_ping_with_decimal_commas_and_in_another_language(tmp_path: Path) -> Non
     assert found.span == pytest.approx(2.00125)  # stamps less the round trip
 
 
+@pytest.mark.parametrize(
+    "summary",
+    [
+        "5 Pakete übertragen, 3 empfangen, 40% Paketverlust, Zeit 80 ms",
+        "5 paquets transmis, 3 reçus, 40% packet loss, time 80ms",
+        "5 packets transmitted, 3 received, +1 errors, 40% packet loss, time 80ms",
+        "5 packets transmitted, 3 received, 1 packets out of wait time, 40.0% packet loss, time 80ms",
+    ],
+)
+def test_the_summary_of_ping_counts_what_was_lost_last_in_any_language(tmp_path: Path, summary: str) -> None:
+    lines = [f"64 Bytes von 1.1.1.1: icmp_seq={n} ttl=64 Zeit=0,5 ms" for n in (1, 2, 3)]
+    text = "\n".join(
+        ["PING 1.1.1.1 (1.1.1.1) 56(84) Bytes Daten.", *lines, "", "--- 1.1.1.1 ping-Statistik ---", summary]
+    )
+    found = read(tmp_path / "a", text + "\nrtt min/avg/max/mdev = 0,5/0,5/0,5/0,0 ms\n")
+    assert (found.packets, lost(found), found.malformed.count) == (5, [3, 4], 0)
+    assert found.interval == pytest.approx(0.02)
+
+
 def test_ping_that_was_cut_at_its_beginning_and_in_a_number(tmp_path: Path) -> None:
     found = read(
         tmp_path / "a",
@@ -285,6 +304,53 @@ def test_numbers_of_a_table_begin_anew_and_may_be_missing(tmp_path: Path) -> Non
     flags = read(tmp_path / "c", "seq,lost\n1,0\n2,1\n5,0\n")
     assert flags.packets == 3
     assert "numbers are missing in 1 places" in said(flags)
+
+
+@pytest.mark.parametrize("head", ["seq,sent,received", "seq,time,received", "seq,received"])
+def test_a_table_of_what_a_receiver_got_shows_losses_by_its_numbers(tmp_path: Path, head: str) -> None:
+    rows = [(n, 100.0 + 0.02 * n, 100.0 + 0.02 * n + 0.004) for n in (0, 1, 4, 3, 3, 6)]
+    rows = [(n, *times[-(head.count(",")) :]) for n, *times in rows]
+    found = read(tmp_path / "a", head + "\n" + "".join(",".join(f"{v:.7g}" for v in row) + "\n" for row in rows))
+    assert (found.packets, lost(found), found.duplicates, found.reordered) == (7, [2, 5], 1, 1)
+    assert found.interval == pytest.approx(0.02)
+    assert found.uplink is not None
+    if head == "seq,received":
+        assert found.uplink.delay is None
+        assert "times are those of arrival" in said(found)
+    else:
+        assert found.uplink.delay is not None
+        assert np.nanmax(np.abs(found.uplink.delay - 0.004)) < 1e-4
+
+
+def test_a_table_that_names_its_losses_says_nothing_of_numbers_that_are_missing(tmp_path: Path) -> None:
+    found = read(tmp_path / "a", "seq,sent,received\n0,1.0,1.1\n1,2.0,\n4,5.0,5.1\n")
+    assert (found.packets, lost(found)) == (3, [1])
+    assert "numbers are missing in 1 places" in said(found)
+
+
+def test_a_date_in_smaller_units_is_one_and_that_is_said(tmp_path: Path) -> None:
+    for digits in (3, 6, 9):
+        rows = "".join(f"{1_700_000_000 * 10**digits + i * 2 * 10 ** (digits - 2)},{i % 2}\n" for i in range(5))
+        found = read(tmp_path / "a", "timestamp,lost\n" + rows)
+        assert found.interval == pytest.approx(0.02, abs=1e-6)
+        assert "it is taken for that" in said(found)
+    assert read(tmp_path / "a", "t,lost\n1700000000,0\n1700000001,1\n").notes == (
+        "one direction was measured, and is taken for the uplink",
+    )
+
+
+def test_stamps_that_are_coarser_than_packets_are_apart(tmp_path: Path) -> None:
+    found = read(
+        tmp_path / "a", "time,lost\n" + "".join(f"{1000 + i // 10},{int(i in (34, 35))}\n" for i in range(100))
+    )
+    assert found.sent == pytest.approx(0.1 * np.arange(100))
+    assert "90 of 100 packets have the time of the one before" in said(found)
+
+
+def test_separators_between_quotation_marks_separate_nothing(tmp_path: Path) -> None:
+    text = 'time,"note, if any",lost\n0,"a, b",0\n0.02,"say ""x, y""",1\n0.04,,0\n0.06,"a,0\n'
+    found = read(tmp_path / "a", text)
+    assert (found.packets, lost(found), found.malformed.count) == (3, [1], 1)
 
 
 # -- mahimahi, iperf3, what is none ------------------------------------------------------------------------------------
