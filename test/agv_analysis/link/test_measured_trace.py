@@ -95,8 +95,8 @@ def test_a_loss_on_a_way_that_is_known_stays_there(rtt: str) -> None:
     assert link.downlink_lost is not None
     assert link.downlink_lost.tolist() == [False, False, not blind, True, True]  # not sent: as before
     assert link.notes == (
-        f"2 losses on a way that is not known are taken for the {'uplink' if blind else 'downlink'}'s, beside 1 that are "
-        f"known to be the uplink's and 1 the downlink's, its delay is not known (--rtt {rtt})",
+        f"2 losses on a way that is not known are taken for the {'uplink' if blind else 'downlink'}'s, beside 1 that "
+        f"are known to be the uplink's and 1 the downlink's, its delay is not known (--rtt {rtt})",
     )
     fitted = fitted_scenario(load_scenario(str(REPOSITORY / "config/outages.yaml")), link, 0.02).relay
     assert fitted.uplink.model != "perfect"

@@ -156,7 +156,7 @@ def test_many_keys_are_matched_as_few_are(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_capture_of_the_other_end_goes_with_a_capture(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("time,lost\n1,0\n2,1\n")
-    with pytest.raises(MeasurementError, match="is no capture .* and --received is a capture of the other end"):
+    with pytest.raises(MeasurementError, match=r"is no capture .* and --received is a capture of the other end"):
         read_link(path, Options(received=path))
 
 
