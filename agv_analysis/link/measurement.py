@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,6 +164,20 @@ class Setting:
 
 
 Reading = Measurement | LossRates | Setting
+
+
+def needs_memory(path: Path, bytes_: float) -> None:
+    """Raises MeasurementError if so many bytes are more than this machine has left, as far as it says."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return
+    left = next((1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")), bytes_)
+    if bytes_ > left:
+        raise MeasurementError(
+            f"{path}: takes {bytes_ / 1e9:.3g} GB of memory at least, since it is read as a whole, and "
+            f"{left / 1e9:.3g} GB are left: give a part of it"
+        )
 
 
 def of_one_way(outcome: Codes) -> Codes:

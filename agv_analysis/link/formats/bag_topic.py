@@ -23,6 +23,7 @@ from agv_analysis.link.measurement import (
     Measurement,
     MeasurementError,
     PacketOutcomes,
+    needs_memory,
 )
 from agv_analysis.link.packet_grid import PacketGrid
 from agv_analysis.recordings.sampling import period_of
@@ -34,6 +35,9 @@ _SLOTS = ("edge/slot", "agv/slot")
 _MOST = 100_000_000
 """Places of a grid: stamps that need more are on none."""
 
+_LEAST = 100
+"""Bytes that a message takes in memory, at least."""
+
 
 def _matches(head: bytes, path: Path) -> bool:
     return looks_like_bag(path, head)
@@ -43,12 +47,14 @@ def _read(path: Path, options: Options) -> Measurement:
     held = _read_bag(path, (), options)
     slots = [topic for name in _SLOTS for topic in held.topics if topic.strip("/").endswith(name)]
     if not options.topic and slots:
+        needs_memory(path, _LEAST * sum(held.topics[topic].count for topic in slots))
         return _of_slots(_read_bag(path, slots, options), slots)
     topics = [topic for topic in held.topics if topic.strip("/") == options.topic.strip("/")]
     if not topics:
         known = ", ".join(f"{name} ({topic.count})" for name, topic in sorted(held.topics.items()))
         asked = f"has no topic {options.topic}" if options.topic else "is a recording: name a topic with --topic"
         raise MeasurementError(f"{path}: {asked}; it has {known}")
+    needs_memory(path, _LEAST * held.topics[topics[0]].count)
     return measure_topic(_read_bag(path, topics, options), topics[0], options.interval)
 
 

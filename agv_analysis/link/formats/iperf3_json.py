@@ -13,8 +13,11 @@ import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.text_columns import open_binary
-from agv_analysis.link.measurement import LossRates, MeasurementError
+from agv_analysis.link.measurement import LossRates, MeasurementError, needs_memory
 from agv_ros.json_text import parse_json
+
+_EXPANDS = 4
+"""Bytes in memory of a byte of JSON, at least."""
 
 Row = tuple[float, float, int, int]
 
@@ -24,6 +27,7 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> LossRates:
+    needs_memory(path, _EXPANDS * path.stat().st_size)
     with open_binary(path) as file:
         try:
             content = parse_json(file.read())

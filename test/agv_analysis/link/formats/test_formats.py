@@ -386,6 +386,15 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 }  # fmt: skip
 
 
+def test_what_is_read_as_a_whole_is_refused_where_it_does_not_fit(tmp_path: Path) -> None:
+    path = tmp_path / "iperf3.json"
+    path.write_text('{"test_start": {}}')
+    with path.open("r+b") as file:
+        file.truncate(1 << 43)  # takes no space where nothing is written
+    with pytest.raises(MeasurementError, match=r"takes 3\.52e\+04 GB of memory at least, since it is read as a whole"):
+        read_link(path)
+
+
 def test_formats_are_found_by_content_whatever_the_name(tmp_path: Path) -> None:
     for name, write in WRITERS.items():
         path = write(tmp_path / "file.dat")
