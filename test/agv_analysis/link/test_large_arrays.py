@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from agv_analysis.link import large_arrays
 from agv_analysis.link.large_arrays import (
@@ -80,8 +82,8 @@ def test_sizes_and_counts_are_those_of_the_values() -> None:
 @pytest.mark.parametrize("dtype", [np.float64, np.uint64, np.int64])
 def test_a_large_array_is_sorted_as_a_small_one_is(dtype: type, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(2)
-    values = np.concatenate((rng.integers(0, 50, 3000), rng.integers(0, 2**60, 2000), [7] * 400)).astype(dtype)
-    rng.shuffle(values)
+    drawn = np.concatenate((rng.integers(0, 50, 3000), rng.integers(0, 2**60, 2000), np.full(400, 7)))
+    values: NDArray[Any] = rng.permutation(drawn).astype(dtype)
     ordered, firsts = np.argsort(values, kind="stable"), np.unique(values, return_index=True)[1]
     monkeypatch.setattr(large_arrays, "_TOGETHER", 256)
     monkeypatch.setattr(large_arrays, "_SAMPLED", 4)

@@ -285,16 +285,16 @@ def test_between_two_hosts_what_a_relay_drops_and_delays_is_known_each_way(two_h
     assert np.flatnonzero(found.downlink.lost).tolist() == down
     figures = LinkFigures(found).to_json()
     assert figures["uplink"]["loss_rate"]["value"] == pytest.approx(6 / 600)
-    assert figures["uplink"]["outage_max_s"] == pytest.approx(0.008, rel=0.5)
+    assert figures["downlink"]["loss_rate"]["value"] == pytest.approx(3 / 594)
     assert found.uplink.delay is not None
     assert found.downlink.delay is not None
     for delay, other, (begin, end, seconds) in (
         (found.uplink.delay, found.downlink.delay, late[PACKET]),
         (found.downlink.delay, found.uplink.delay, late[ANSWER]),
     ):
-        before = np.nanmedian(delay[20:100])
-        assert np.nanmedian(delay[begin:end]) - before > 0.9 * seconds
-        assert np.nanmedian(other[begin:end]) - np.nanmedian(other[20:100]) < 0.5 * seconds
+        # Whatever else the machine does, none is early, and the fastest ones of the other way are not late.
+        assert np.nanmin(delay[begin:end]) > 0.9 * seconds
+        assert np.nanmin(other[begin:end]) < 0.5 * seconds
 
 
 def test_between_two_hosts_with_netem(two_hosts: Hosts, tmp_path: Path) -> None:

@@ -84,8 +84,8 @@ def test_where_a_round_trip_was_lost_is_an_assumption_that_is_said(
 def test_a_loss_on_a_way_that_is_known_stays_there(rtt: str) -> None:
     """irtt's words false, true_up, true, true_down, true: picture, trace and driven loop take them alike."""
     up, down = [RECEIVED, LOST, UNKNOWN, RECEIVED, UNKNOWN], [RECEIVED, NOT_SENT, UNKNOWN, LOST, UNKNOWN]
-    codes = (np.array(one, dtype=np.int8) for one in (up, down, [RECEIVED, LOST, LOST, LOST, LOST]))
-    found = Measurement("x", "irtt", 0.02 * np.arange(5.0), *map(PacketOutcomes, codes))
+    ways = [PacketOutcomes(np.array(one, dtype=np.int8)) for one in (up, down, [RECEIVED, *[LOST] * 4])]
+    found = Measurement("x", "irtt", 0.02 * np.arange(5.0), ways[0], ways[1], ways[2])
     figures = LinkFigures(found).to_json()
     for way in ("uplink", "downlink"):
         assert (figures[way]["lost"], figures[way]["unknown"]) == (1, 2)

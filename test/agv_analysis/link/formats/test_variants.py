@@ -308,9 +308,11 @@ def test_numbers_of_a_table_begin_anew_and_may_be_missing(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("head", ["seq,sent,received", "seq,time,received", "seq,received"])
 def test_a_table_of_what_a_receiver_got_shows_losses_by_its_numbers(tmp_path: Path, head: str) -> None:
-    rows = [(n, 100.0 + 0.02 * n, 100.0 + 0.02 * n + 0.004) for n in (0, 1, 4, 3, 3, 6)]
-    rows = [(n, *times[-(head.count(",")) :]) for n, *times in rows]
-    found = read(tmp_path / "a", head + "\n" + "".join(",".join(f"{v:.7g}" for v in row) + "\n" for row in rows))
+    rows = []
+    for n in (0, 1, 4, 3, 3, 6):
+        times = (100.0 + 0.02 * n, 100.004 + 0.02 * n)[-head.count(",") :]
+        rows.append(",".join((str(n), *(f"{time:.7g}" for time in times))))
+    found = read(tmp_path / "a", "\n".join((head, *rows, "")))
     assert (found.packets, lost(found), found.duplicates, found.reordered) == (7, [2, 5], 1, 1)
     assert found.interval == pytest.approx(0.02)
     assert found.uplink is not None
