@@ -14,7 +14,7 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
-.PHONY: demo test coverage bench growth fuzz torture dist lowest pythons docs images sample clean
+.PHONY: demo test coverage bench growth fuzz torture dist lowest pythons docs site images sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
 	rm -rf $(DEMO)
@@ -56,6 +56,9 @@ pythons: $(VENV)/test.stamp ## the cheap tests with each version of Python that 
 docs: $(VENV)/run.stamp ## bring README.md and docs/ up to date with the code
 	$(BIN)/python docs/update.py
 
+site: docs $(VENV)/site.stamp ## the docs as a site for the browser, build/site/index.html, whose search needs no server
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -d build/site-cache docs build/site
+
 images: $(VENV)/test.stamp ## draw the pages in headless Chromium to docs/images
 	$(BIN)/python docs/screenshots.py
 
@@ -76,3 +79,7 @@ $(VENV)/run.stamp: $(VENV)/bin/python setup.py
 $(VENV)/test.stamp: $(VENV)/bin/python setup.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test$(if $(HAVE_ROS),,$(comma)ros)]'
 	touch $@ $(VENV)/run.stamp
+
+$(VENV)/site.stamp: $(VENV)/run.stamp
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[site]'
+	touch $@

@@ -65,6 +65,8 @@ setup(
     | {
         # Everything but ROS itself and what only tests need.
         "all": ALL,
+        # The docs as a site: `make site`.
+        "site": ["furo>=2024.1", "myst-parser>=2.0", "sphinx>=7.0"],
         # ROS 2 Jazzy's rclpy with Fast DDS from PyPI, for machines where no ROS is installed.
         "ros": ["ros-jazzy-rclpy>=7.1.6", "ros-rclpy[fastrtps]>=7.1.6", "ros-jazzy-common-interfaces>=5.3.6"],
         "test": [

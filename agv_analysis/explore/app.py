@@ -20,11 +20,12 @@ from agv_analysis.explore.background_criteria import (
     tube_traces,
 )
 from agv_analysis.explore.guard import check_request, guard, said
-from agv_analysis.explore.page_layout import SHOWN_FOR_A_LAW, STYLE, layout, styles_of
+from agv_analysis.explore.idle_controls import CONTROLS, idle_controls, idle_lines
+from agv_analysis.explore.page_layout import SHOWN_FOR_A_LAW, STYLE, layout, reason_text, styles_of
 from agv_analysis.explore.positions import difference, from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, Values, preset_values, scenario_of, values_of
-from agv_analysis.explore.sliders import CHANNEL_SLIDERS, CHOICES, GAIN_SLIDERS, SLIDERS, acts
+from agv_analysis.explore.sliders import CHOICES, GAIN_SLIDERS, SLIDERS
 from agv_analysis.scenario import Scenario
 from agv_ros.errors import UserError
 
@@ -62,7 +63,7 @@ def build(
         "agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets", url_base_pathname=path
     )
     app.index_string = app.index_string.replace("{%css%}", "{%css%}<style>" + STYLE + "</style>")
-    app.layout = layout(dash, values_of(base))
+    app.layout = layout(dash, values_of(base), idle_controls(base, ""))
     _connect(dash, app, base, criteria, tube)
     return app
 
@@ -105,15 +106,26 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
         rows = _table(dash.html, found.rows, pinned is not None)
         return found.track, found.time, rows, "", "old", "old", *(found.badge[part] for part in _BADGE), *of_setting
 
+    @app.callback(*(Output(key, "style") for key in SHOWN_FOR_A_LAW), Input("law", "value"), prevent_initial_call=True)
+    def show(law: str) -> Any:
+        return styles_of(law)
+
     @app.callback(
-        *(Output(key, "style") for key in SHOWN_FOR_A_LAW),
-        *(Output(slider.key, "disabled") for slider in CHANNEL_SLIDERS),
-        *(Output(f"of-{slider.key}", "className") for slider in CHANNEL_SLIDERS),
-        Input("law", "value"), Input("model", "value"), prevent_initial_call=True,
+        *(Output(slider.key, "disabled") for slider in SLIDERS),
+        *(Output(f"of-{key}", "className") for key in CONTROLS), *(Output(f"why-{key}", "children") for key in CONTROLS),
+        Output("idle-lines", "children"),
+        *(Input(key, "value") if key in _DECIDING else State(key, "value") for key in KEYS), prevent_initial_call=True,
     )  # fmt: skip
-    def show(law: str, model: str) -> Any:
-        is_off = [not acts(slider, model) for slider in CHANNEL_SLIDERS]
-        return *styles_of(law), *is_off, *("off" if off else "" for off in is_off)
+    def grey(*given: Any) -> Any:
+        now = values(given)
+        try:
+            scenario = asked(now)
+        except UserError:  # `move` says why
+            return [dash.no_update] * (len(SLIDERS) + 2 * len(CONTROLS) + 1)
+        idle = idle_controls(scenario, now["more"])
+        greyed = ["off" if key in idle else "" for key in CONTROLS]
+        reasons = [reason_text(idle.get(key, "")) for key in CONTROLS]
+        return *(one.key in idle for one in SLIDERS), *greyed, *reasons, idle_lines(scenario, now["more"])
 
     app.clientside_callback(_TO_URL, Output("in-url", "data"), Input("setting", "data"), prevent_initial_call=True)
     app.clientside_callback(_DRAWER, Output("drawer", "open"), Input("url", "pathname"))
@@ -208,6 +220,9 @@ def _table(html: Any, rows: list[tuple[str, str, str]], is_pinned: bool) -> list
         html.Tr([html.Th(name), *(html.Td(cell) for cell in (value, other) if cell)]) for name, value, other in rows
     ]
 
+
+_DECIDING = (*CHOICES, "delay", "more")
+"""Controls that decide which others have an effect."""
 
 _BADGE = ("deviation", "when", "losses", "outage")
 """Parts of the badge that each move changes."""

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from agv_analysis.explore.settings import PRESETS
 from agv_analysis.explore.sliders import (
-    CHANNEL_SLIDERS,
     CHOICES,
     GAIN_SLIDERS,
     LOOK_AHEAD,
     LOOKING_AHEAD,
     OTHER_SLIDERS,
     Slider,
-    acts,
 )
 
 STYLE = """
@@ -39,7 +38,7 @@ main { display: flex; flex-wrap: wrap; gap: 1rem; padding: 1rem; max-width: 1500
 #drawer > summary { display: none }
 h1 { font-size: 1.2rem; margin: 0 0 .5rem } h2 { font-size: 1rem; margin: .8rem 0 .2rem }
 label { display: block; font-size: .85rem; color: var(--soft); margin-top: .3rem } label b { color: var(--ink) }
-.off { opacity: .4 } .off label::after { content: " (the chosen channel does not use it)" }
+.off { opacity: .45 } .why { font-style: italic } #idle-lines { font-size: .8rem; color: var(--soft) }
 button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
 th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
 pre { white-space: pre-wrap }
@@ -73,8 +72,11 @@ pre { white-space: pre-wrap }
 """
 
 
-def layout(dash: Any, at_first: dict[str, Any]) -> Any:
-    """The page where lists stand as in `at_first` and sliders at the positions of its values."""
+def layout(dash: Any, at_first: dict[str, Any], idle: Mapping[str, str]) -> Any:
+    """The page where lists stand as in `at_first` and sliders at the positions of its values.
+
+    `idle`: why a control has no effect, by its key.
+    """
     html, dcc = dash.html, dash.dcc
     shown = [
         html.Div(
@@ -110,7 +112,9 @@ def layout(dash: Any, at_first: dict[str, Any]) -> Any:
         dcc.Interval(id="again", interval=PAUSE, max_intervals=AGAIN),
     ]
     drawer = html.Details(
-        [html.Summary("Change the setting"), html.Div(_controls(dash, at_first), id="controls")], id="drawer", open=True
+        [html.Summary("Change the setting"), html.Div(_controls(dash, at_first, idle), id="controls")],
+        id="drawer",
+        open=True,
     )
     return html.Main([drawer, html.Div(shown, id="shown")])
 
@@ -122,26 +126,40 @@ A browser compiles what it has run some times: so it has before a hand moves the
 """
 
 
-def _controls(dash: Any, at_first: dict[str, Any]) -> list[Any]:
+def _controls(dash: Any, at_first: dict[str, Any], idle: Mapping[str, str]) -> list[Any]:
     html, dcc = dash.html, dash.dcc
     controls = [html.H1("What if?")]
     controls += [html.Button(preset.title, id=f"preset-{key}") for key, preset in PRESETS.items()]
     controls.append(html.P("", id="story"))
     for key, choice in CHOICES.items():
-        controls += [html.Label(choice.label), dcc.Dropdown(list(choice.names), at_first[key], id=key, clearable=False)]
+        names = dcc.Dropdown(list(choice.names), at_first[key], id=key, clearable=False)
+        controls.append(_greyable(dash, key, [choice.label], names, idle))
 
     def of(sliders: tuple[Slider, ...]) -> list[Any]:
-        return [_labelled(dash, one, at_first) for one in sliders]
+        return [_labelled(dash, one, at_first, idle) for one in sliders]
 
     styles = dict(zip(SHOWN_FOR_A_LAW, styles_of(at_first["law"]), strict=True))
     sliders_of_groups = {**{_group(law): sliders for law, sliders in GAIN_SLIDERS.items()}, _AHEAD: (LOOK_AHEAD,)}
     controls += [html.Div(of(sliders), id=key, style=styles[key]) for key, sliders in sliders_of_groups.items()]
     controls += of(OTHER_SLIDERS)
     example = "further settings, one a line:\nplant.duration=50.0\nrelay.downlink.model=bernoulli"
-    return [*controls, html.Label("more"), dcc.Textarea(id="more", value="", placeholder=example, rows=3)]
+    further = dcc.Textarea(id="more", value="", placeholder=example, rows=3)
+    return [*controls, html.Label("more"), further, html.Div("", id="idle-lines")]
 
 
-def _labelled(dash: Any, slider: Slider, at_first: dict[str, Any]) -> Any:
+def _greyable(dash: Any, key: str, label: list[Any], control: Any, idle: Mapping[str, str]) -> Any:
+    """A control under its label, greyed where it has no effect, with the reason."""
+    html = dash.html
+    why = html.Span(reason_text(idle.get(key, "")), id=f"why-{key}", className="why")
+    return html.Div([html.Label([*label, why]), control], id=f"of-{key}", className="off" if key in idle else "")
+
+
+def reason_text(reason: str) -> str:
+    """A reason as it stands behind a label."""
+    return f" (no effect: {reason})" if reason else ""
+
+
+def _labelled(dash: Any, slider: Slider, at_first: dict[str, Any], idle: Mapping[str, str]) -> Any:
     html, dcc = dash.html, dash.dcc
     value = at_first[slider.key]
     ends = {slider.position_of(end): f"{end:g}" for end in (slider.low, slider.high)}
@@ -151,12 +169,12 @@ def _labelled(dash: Any, slider: Slider, at_first: dict[str, Any]) -> Any:
     if slider.is_log:
         label += [": ", html.B(f"{value:g}", id=f"{slider.key}-value")]
         options["allow_direct_input"] = False  # a position is no value
-    is_off = slider in CHANNEL_SLIDERS and not acts(slider, at_first["model"])
     moved = dcc.Slider(
         low, high, step, value=slider.position_of(value), marks=ends, id=slider.key, updatemode="drag",
-        disabled=is_off, **{name: on for name, on in options.items() if name in dcc.Slider().available_properties},
+        disabled=slider.key in idle,
+        **{name: on for name, on in options.items() if name in dcc.Slider().available_properties},
     )  # fmt: skip
-    return html.Div([html.Label(label), moved], id=f"of-{slider.key}", className="off" if is_off else "")
+    return _greyable(dash, slider.key, label, moved, idle)
 
 
 def _group(law: str) -> str:

@@ -131,16 +131,6 @@ OTHER_SLIDERS = (
     Slider("seed", "seed of the outages", 1.0, 100.0, 1.0, "relay.seed"),
 )
 
-CHANNEL_SLIDERS = tuple(slider for slider in OTHER_SLIDERS if slider.key in ("p", "r", "n"))
-"""What only some channels use."""
-
-
-def acts(slider: Slider, model: str) -> bool:
-    """Does a channel model use the parameter of one of CHANNEL_SLIDERS? Its description says which models do."""
-    known = parameters_of(SCHEMAS["relay"])[slider.target.removeprefix("relay.")]
-    return any(clause.startswith(f"{model}: ") for clause in known.description.split("; "))
-
-
 SLIDERS = (*(slider for sliders in GAIN_SLIDERS.values() for slider in sliders), LOOK_AHEAD, *OTHER_SLIDERS)
 """All sliders."""
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from agv_analysis.explore.sliders import CHANNEL_SLIDERS, GAIN_SLIDERS, OTHER_SLIDERS, Slider, acts
+from agv_analysis.explore.sliders import GAIN_SLIDERS, OTHER_SLIDERS, Slider
+from agv_analysis.idle_parameters import idle_parameters
 from agv_analysis.scenario import SCHEMAS, Scenario
 from agv_ros.parameters import as_dict, parameters_of
 
-_LIMITS = tuple(slider for slider in OTHER_SLIDERS if slider.target == "controller.v_max")
+_OTHERS = tuple(slider for slider in OTHER_SLIDERS if slider.key in ("v_max", "p", "r", "n"))
 
 
 def controls_of(scenario: Scenario) -> list[dict[str, Any]]:
@@ -17,12 +18,8 @@ def controls_of(scenario: Scenario) -> list[dict[str, Any]]:
 
     None among the values, and as the value: no limit.
     """
-    model = scenario.relay.uplink.model
-    sliders = (
-        *GAIN_SLIDERS.get(scenario.controller.law, ()), *_LIMITS,
-        *(slider for slider in CHANNEL_SLIDERS if acts(slider, model)),
-    )  # fmt: skip
-    return [_control(slider, scenario) for slider in sliders if _changes(slider)]
+    sliders, idle = (*GAIN_SLIDERS.get(scenario.controller.law, ()), *_OTHERS), idle_parameters(scenario)
+    return [_control(slider, scenario) for slider in sliders if slider.target not in idle and _changes(slider)]
 
 
 def _changes(slider: Slider) -> bool:

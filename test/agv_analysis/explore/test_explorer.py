@@ -492,18 +492,24 @@ def test_the_badge_says_word_deviation_and_confidence_and_nothing_moves(page: Pa
     page.until(lambda: page.text("story") == "")
 
 
-def test_what_a_channel_does_not_use_is_greyed(page: Page) -> None:
+def test_what_has_no_effect_is_greyed_with_the_reason(page: Page) -> None:
     def off() -> list[str]:
-        return [key for key in ("p", "r", "n") if page.slider(key).get_attribute("data-disabled") is not None]
+        greyed = page.chrome.find_elements("css selector", "#controls .off")
+        return [str(one.get_attribute("id")).removeprefix("of-") for one in greyed if one.is_displayed()]
 
     assert off() == ["n"]  # gilbert_elliott
-    expected = {"perfect": ["p", "r", "n"], "bernoulli": ["r", "n"], "burst": ["p", "r"]}
+    expected = {"perfect": ["policy", "p", "r", "n", "seed"], "bernoulli": ["r", "n"], "burst": ["p", "r", "seed"]}
     for model in expected:
         choose(page, "model", model)
         page.until(functools.partial(lambda name: off() == expected[name], model))
-    assert "the chosen channel does not use it" in page.chrome.execute_script(
-        "return getComputedStyle(document.querySelector('#of-r label'), '::after').content"
-    )
+        disabled = {key for key in ("p", "r", "n") if page.slider(key).get_attribute("data-disabled") is not None}
+        assert disabled == {"p", "r", "n"} & set(expected[model])
+    assert page.text("why-r") == "(no effect: uplink.model is burst)"
+    page.chrome.find_element("id", "more").send_keys("controller.kx=40.0\nplant.bicycle.wheelbase=2.0")
+    page.until(lambda: off() == ["kx", "p", "r", "seed"])
+    assert page.text("why-kx") == "(no effect: set under more)"
+    assert page.text("idle-lines") == "plant.bicycle.wheelbase has no effect: vehicle is unicycle"
+    assert complaints(page) == []
 
 
 def test_the_address_holds_the_setting(page: Page, address: str) -> None:
