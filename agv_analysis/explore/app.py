@@ -112,7 +112,8 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
 
     @app.callback(
         *(Output(slider.key, "disabled") for slider in SLIDERS),
-        *(Output(f"of-{key}", "className") for key in CONTROLS), *(Output(f"why-{key}", "children") for key in CONTROLS),
+        *(Output(f"of-{key}", "className") for key in CONTROLS),
+        *(Output(f"why-{key}", "children") for key in CONTROLS),
         Output("idle-lines", "children"),
         *(Input(key, "value") if key in _DECIDING else State(key, "value") for key in KEYS), prevent_initial_call=True,
     )  # fmt: skip
