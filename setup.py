@@ -16,6 +16,8 @@ EXTRAS = {
     "report": ["jinja2>=3.0", "matplotlib>=3.6", "plotly>=6.0"],
     # The pages of `agv-ncs explore` and `agv-ncs watch`.
     "explore": ["dash>=3.0", "flask>=2.2", "plotly>=6.0", "werkzeug>=3.0"],
+    # `agv-ncs watch --foxglove`.
+    "foxglove": ["foxglove-sdk>=0.14"],
     # Sweeps on a Dask cluster, and results as Parquet.
     "cluster": ["distributed>=2023.1"],
     "parquet": ["pyarrow>=12.0"],
@@ -92,6 +94,7 @@ setup(
             "twine>=5.0",
             "types-PyYAML",
             "uv>=0.4",
+            "websockets>=12.0",
             "wheel>=0.40",
         ],
     },

@@ -184,7 +184,7 @@ for k = 1:N
 end
 printf("%.9f %.17g\\n", toc, X(2, N));
 """
-"""The paper's equations as its MATLAB would have them, with the outdated pose of its eq. 1000."""
+"""The paper's equations as its MATLAB would have them, with the outdated pose of its eq. 16."""
 
 
 def _octave(reference: NDArray[np.float64], lost: NDArray[np.bool_]) -> float | None:

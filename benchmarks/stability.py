@@ -79,7 +79,7 @@ def _seconds(tries: int, work: Callable[[], object]) -> float:
 
 
 def _one_by_one(theta: Floats, theta_held: Floats, v: Floats, gains: ControllerParameters, ts: float) -> list[float]:
-    """The test step by step, each matrix as eq. 55 has it."""
+    """The test step by step, each matrix as eq. 21 has it."""
     found, kx, ky, ktheta = [], gains.kx, gains.ky, gains.ktheta
     for th, th_n, v_n in zip(theta.tolist(), theta_held.tolist(), v.tolist(), strict=True):
         c, s, c_n, s_n = math.cos(th), math.sin(th), math.cos(th_n), math.sin(th_n)

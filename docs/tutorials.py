@@ -15,6 +15,7 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -130,14 +131,20 @@ def _inside(folder: str) -> Iterator[None]:
         os.chdir(before)
 
 
+def in_a_process(words: list[str]) -> tuple[int, str]:
+    """`agv-ncs` as a user runs it."""
+    program = [sys.executable, "-m", "agv_analysis.cli", *words]
+    environment = {**os.environ, "COLUMNS": str(WIDTH)}
+    done = subprocess.run(
+        program, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    return done.returncode, done.stdout
+
+
 def main() -> None:
     """Bring all tutorials up to date."""
-    os.environ["COLUMNS"] = str(WIDTH)
-    sys.path.insert(0, str(REPOSITORY))
-    from test.command_runner import run_command
-
     for path in PAGES:
-        update(path, run_command)
+        update(path, in_a_process)
 
 
 if __name__ == "__main__":

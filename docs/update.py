@@ -42,17 +42,20 @@ def parameters_page() -> str:
 def paper_page(out: str) -> str:
     """docs/paper.md; the paper is reproduced in the directory `out`."""
     from agv_analysis.output_file import MARKDOWN_MARK
+    from agv_analysis.reproduce.citation import CITATION
 
     command("reproduce", "--out", out)
     return (
-        "# The paper's claims\n\nMade by `agv-ncs reproduce`, which also draws the paper's figures. Every value is "
-        "measured when the command runs, on the scenario of `config/paper.yaml` with the settings that the claim "
-        "names; with `--ros` on recorded runs of the nodes. What no single run shows (twins, a pose that is always n "
-        "steps old, scans of a gain) is simulated either way. The paper's text gives neither its track nor K_y and "
-        "K_theta: the scenario is a choice.\n\nAn error has settled when less than 1 cm is left of it, a command when "
-        "`v - v_r` stays within 2 % of its largest value. Steps count from k = 0. Twins are two AGVs that begin a "
-        "micrometre apart and meet the same losses; their number is their distance at the end as a multiple of that at "
-        "the beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8").removesuffix(MARKDOWN_MARK)
+        f"# The paper's claims\n\n{CITATION}.\n\n"
+        "Made by `agv-ncs reproduce`, which also draws the paper's figures, and writes a page, `claims.html`, with the "
+        "claims beside them. Every value is measured when the command runs, on the scenario of `config/paper.yaml` "
+        "with the settings that the claim names; with `--ros` on recorded runs of the nodes. What no single run shows "
+        "(twins, a pose that is always n steps old, scans of a gain) is simulated either way. The paper's text gives "
+        "neither its track nor K_y and K_theta: the scenario is a choice. Sections and equations are numbered as the "
+        "paper prints them.\n\nAn error has settled when less than 1 cm is left of it, a command when `v - v_r` stays "
+        "within 2 % of its largest value. Steps count from k = 0. Twins are two AGVs that begin a micrometre apart and "
+        "meet the same losses; their number is their distance at the end as a multiple of that at the "
+        "beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8").removesuffix(MARKDOWN_MARK)
     )
 
 
@@ -173,7 +176,8 @@ def main() -> None:
     (REPOSITORY / "docs/stability.md").write_text(stability_page(), encoding="utf-8")
     (REPOSITORY / "docs/python_api.md").write_text(python_api_page(), encoding="utf-8")
     (REPOSITORY / "docs/parameters.md").write_text(parameters_page(), encoding="utf-8")
-    subprocess.run([sys.executable, "docs/public_api.py"], cwd=REPOSITORY, check=True)
+    for script in ("docs/public_api.py", "docs/tutorials.py"):
+        subprocess.run([sys.executable, script], cwd=REPOSITORY, check=True)
     (REPOSITORY / "README.md").write_text(readme_with(demo_block(analysed)), encoding="utf-8")
 
 

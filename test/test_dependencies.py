@@ -20,10 +20,10 @@ from agv_analysis.runtime.executables import NODE_MODULES
 REPOSITORY = Path(__file__).parents[1]
 OURS = {"agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs"}
 ROS = re.compile(r"rclpy|launch(_ros)?|.*_msgs|.*_interfaces")
-DISTRIBUTION = {"yaml": "pyyaml"}
+DISTRIBUTION = {"yaml": "pyyaml", "foxglove": "foxglove-sdk"}
 """Where a package is imported by another name than pip's."""
 
-FOR_PEOPLE = {"bags", "report", "explore", "cluster", "parquet", "captures", "irtt"}
+FOR_PEOPLE = {"bags", "report", "explore", "cluster", "parquet", "captures", "irtt", "foxglove"}
 
 NEEDED_BY_OTHERS = {"setuptools": "colcon builds by it"}
 
@@ -35,6 +35,7 @@ ROOMS = {
     "parquet": ("agv_analysis/sweep/rows_file.py", "agv_analysis/bags/export.py"),
     "captures": ("agv_analysis/link/formats/capture_packets.py",),
     "irtt": ("agv_analysis/link/formats/irtt_json.py",),
+    "foxglove": ("agv_analysis/watch/foxglove_server.py",),
 }
 """Where the packages of each extra may be imported."""
 

@@ -20,18 +20,14 @@ from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.staleness.registry import STALENESS_POLICIES
 from agv_plant.vehicle.registry import VEHICLES
 from agv_ros.part_registry import Registry
+from test.command_runner import run_command
 
 REPOSITORY = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
 def update() -> Any:
-    spec = importlib.util.spec_from_file_location("update", REPOSITORY / "docs/update.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return module_of_docs("update")
 
 
 def test_the_page_of_parameters_is_current(update: Any) -> None:
@@ -72,6 +68,85 @@ def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> N
     update.command("run", "config/outages.yaml", "--bag", bag)
     block = update.demo_block(update.command("analyse", bag))
     assert block in (REPOSITORY / "README.md").read_text()
+
+
+def module_of_docs(name: str) -> Any:
+    """A script of docs/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, REPOSITORY / f"docs/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.no_cover
+@pytest.mark.parametrize("page", sorted(path.stem for path in (REPOSITORY / "docs/tutorials").glob("*.md")))
+def test_the_blocks_of_a_tutorial_run_in_order_and_print_what_it_shows(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tutorials = module_of_docs("tutorials")
+    monkeypatch.setenv("COLUMNS", str(tutorials.WIDTH))
+    monkeypatch.chdir(tmp_path)
+    tutorials.fresh_files(tmp_path)
+    text = (REPOSITORY / f"docs/tutorials/{page}.md").read_text(encoding="utf-8")
+    assert len(tutorials.blocks(text)) == len(re.findall(r"^```(?:console|python)$", text, re.MULTILINE)) > 2
+    for block, printed in tutorials.run(text, run_command):
+        assert block.shown is None or tutorials.is_shown(block.shown, printed), printed
+    for name in tutorials.PICTURE.findall(text):
+        assert (tmp_path / f"{name}.png").stat().st_size > 0
+        assert (REPOSITORY / f"docs/images/tutorial_{name}.png").stat().st_size > 0
+
+
+def test_what_a_tutorial_shows_may_leave_out_lines_but_no_other_ones() -> None:
+    tutorials = module_of_docs("tutorials")
+    assert tutorials.is_shown("a\n...\nd\n", "a  \nb\nc\nd")
+    assert not tutorials.is_shown("a\n...\nd\n", "a\nb\nc")
+    page = "```python\nprint(2)\n```\n\n```text\n1\n```\n"
+    assert tutorials.with_printed(page, ["2\n"]) == page.replace("\n1\n", "\n2\n")
+    assert tutorials.with_printed(page, ["1\n"]) == page
+    with pytest.raises(ValueError, match="choose anew"):
+        tutorials.with_printed(page.replace("\n1\n", "\n1\n...\n"), ["2\n"])
+
+
+def test_the_navigation_of_the_site_names_every_page_once() -> None:
+    docs = REPOSITORY / "docs"
+    named = re.findall(r"^   ([\w/]+)$", (docs / "index.rst").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(named) == sorted(str(page.relative_to(docs).with_suffix("")) for page in docs.rglob("*.md"))
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of the headings of a page, as GitHub and the site's generator make them."""
+    headings = re.findall(
+        r"^#+ (.+)$", re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL), re.MULTILINE
+    )
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_link_to_a_file_and_to_a_heading_leads_there() -> None:
+    """Those to elsewhere are not followed."""
+    pages = [*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")]
+    wrong = []
+    for page in pages:
+        for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+            path, _, heading = target.partition("#")
+            to = page.parent / path if path else page
+            if not re.match(r"https?:", target) and not (to.exists() and (not heading or heading in anchors(to))):
+                wrong.append(f"{page.relative_to(REPOSITORY)}: {target}")
+    assert wrong == []
+    assert len(pages) > 40
+
+
+def test_rosdoc2_finds_the_pages() -> None:
+    import xml.etree.ElementTree as ElementTree
+
+    import yaml
+
+    found = ElementTree.parse(REPOSITORY / "package.xml").findtext("export/rosdoc2")
+    assert found is not None
+    _, settings = yaml.safe_load_all((REPOSITORY / found).read_text(encoding="utf-8"))
+    (builder,) = settings["builders"]
+    assert (REPOSITORY / builder["sphinx"]["sphinx_sourcedir"] / "conf.py").is_file()
 
 
 def test_the_answer_in_metres_of_the_readme_is_true() -> None:

@@ -232,7 +232,7 @@ def test_a_law_that_was_edited_is_judged_as_it_is(copied: Path, tmp_path: Path) 
         edited = found("stability", *line)["n_max"]
         assert edited["lifted"] == 5  # a = 0.25 < 2 sin(pi / (2 (2n + 1))), 0.2846 at n = 5 and 0.2411 at n = 6
         assert edited["bursts"] == 6  # (n + 1) a < 2
-        assert edited["paper"] is None  # eq. 55 is of another law
+        assert edited["paper"] is None  # eq. 21 is of another law
         file.write_text(as_it_was.replace("+ kx * x_e", "- kx * x_e"))
         assert found("simulate", *line)["verdict"] not in ("asymptotic", "mean-square", "bounded")
     finally:

@@ -159,7 +159,7 @@ def show_measurement(
         figures = found.to_json()
     console.print(
         f"[bold]{escape(measured.source)}[/]: {measured.format}, {measured.packets} packets in {measured.span:.6g} s, "
-        f"one every {1e3 * measured.interval:.6g} ms",
+        f"one every {1e3 * measured.interval:.4g} ms",
         soft_wrap=True,
     )
     table = Table(box=None, pad_edge=False)
@@ -257,7 +257,7 @@ def _rate(direction: DirectionFigures) -> str:
 
 
 def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.6g} ms"
+    return f"{1e3 * seconds:.4g} ms"
 
 
 def _spread(spread: Spread | None) -> str:

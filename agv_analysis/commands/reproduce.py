@@ -31,7 +31,8 @@ def command(out: Path, ros: bool) -> None:
     from rich.console import Console
 
     from agv_analysis.output_file import is_forced, is_ours
-    from agv_analysis.reproduce import dot_plot, report
+    from agv_analysis.reproduce import claims_page, dot_plot, report
+    from agv_analysis.reproduce.citation import CITATION
     from agv_analysis.reproduce.claim import check
     from agv_analysis.reproduce.claims import CLAIMS
     from agv_analysis.reproduce.figures import figures, write
@@ -45,6 +46,7 @@ def command(out: Path, ros: bool) -> None:
     if any(out.iterdir()) and not is_forced() and not is_ours(out / report.CLAIMS_FILE):
         raise UserError(f"{out}: is not empty and holds no earlier result: name another directory, or give --force")
     runs = _runs(out, ros)
+    click.echo(CITATION)
     with Console(stderr=True).status("driving the paper's runs ..."):
         drawn = list(figures(runs))
         for figure in drawn:
@@ -58,9 +60,11 @@ def command(out: Path, ros: bool) -> None:
     for table in found:
         report.print_table(table)
     report.write(findings, found, "recorded runs" if ros else "simulation", out)
+    claims_page.write(findings, drawn, found, out)
     for figure in drawn:
-        click.echo(f"{out / figure.name}.svg: {figure.where}")
+        click.echo(f"{out / figure.file_name}.svg: {figure.where}")
     click.echo(f"figures and tables: {out}")
+    click.echo(f"page: {out / claims_page.PAGE}")
 
 
 def _runs(out: Path, ros: bool) -> Runs:

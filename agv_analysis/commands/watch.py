@@ -19,10 +19,15 @@ from agv_analysis.commands import needs_ros
               help="Where bags go that the page saves.")  # fmt: skip
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address of this machine to serve the page on.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8051, show_default=True, help="0: any free one.")
+@click.option("--foxglove", is_flag=True,
+              help="Serve the topics to Foxglove and Lichtblick as well, to programs on this machine.")  # fmt: skip
+@click.option(
+    "--foxglove-port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="0: any free one."
+)
 @click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
 def command(
     namespace: str, config: Path | None, plant_domain: int | None, edge_domain: int | None, save_to: Path, host: str,
-    port: int, no_browser: bool,
+    port: int, foxglove: bool, foxglove_port: int, no_browser: bool,
 ) -> None:  # fmt: skip
     """Watch a running loop in the browser: track, deviation, speed, losses, and what they say of it. Ctrl-C stops it.
 
@@ -33,6 +38,7 @@ def command(
     Examples:
       agv-ncs watch
       agv-ncs watch --namespace agv_03
+      agv-ncs watch --foxglove
       agv-ncs watch --host 192.168.1.20 --port 8051 --no-browser
     """
     with needs_ros():
@@ -44,7 +50,9 @@ def command(
     if not of_run:
         click.echo(discovery_note(), err=True)
 
-    def ready(address: str) -> None:
+    def ready(address: str, to_foxglove: str) -> None:
+        if to_foxglove:
+            click.echo(f"Foxglove: {to_foxglove} (layout: config/foxglove.json)")
         click.echo(f"{SERVED}{address}" + ("" if of_run else " (Ctrl-C stops it)"))
         if not no_browser:
             import webbrowser
@@ -53,4 +61,13 @@ def command(
 
     domains = tuple(-1 if domain is None else domain for domain in (plant_domain, edge_domain))
     stop = (lambda: click.echo(STOP)) if of_run else None
-    watch(namespace, config, (domains[0], domains[1]), save_to, (host, port), ready, stop)
+    watch(
+        namespace,
+        config,
+        (domains[0], domains[1]),
+        save_to,
+        (host, port),
+        ready,
+        stop,
+        foxglove_port if foxglove else None,
+    )

@@ -40,7 +40,7 @@ class ErrorMetrics:
 
 
 def body_errors(reference: Floats, pose: Floats) -> Floats:
-    """eps(k) = T_e(theta_c(k)) [X_r(k) - X_c(k)] (the paper's eq. 10) at every step, shape (N, 3).
+    """eps(k) = T_e(theta_c(k)) [X_r(k) - X_c(k)] (the paper's eq. 3) at every step, shape (N, 3).
 
     `reference` has shape (N, 3) or more columns, of which the first three count; `pose` has shape (N, 3).
     """

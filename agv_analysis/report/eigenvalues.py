@@ -18,7 +18,7 @@ _EIGENVALUE_STEPS = 400
 
 
 def paper_eigenvalues(run: Run) -> NDArray[np.complex128]:
-    """Eigenvalues of A(k) (eq. 55) at up to 400 steps of a run, evenly spread, shape (M,); none where it diverged."""
+    """Eigenvalues of A(k) (eq. 21) at up to 400 steps of a run, evenly spread, shape (M,); none where it diverged."""
     if not applies_to(run.scenario):
         return np.empty(0, dtype=np.complex128)
     some = np.unique(np.linspace(0, len(run) - 1, _EIGENVALUE_STEPS).astype(np.int64))

@@ -106,8 +106,22 @@ def all_panels(analysis: Observations, within: CorridorOfRun | None = None) -> l
     return [*with_edges, corridor_panel(expected)]
 
 
+def template(name: str) -> Any:
+    """A template of this folder. Raises UserError if jinja2 is not installed."""
+    jinja2: Any = _needed("jinja2")
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    return jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(name)
+
+
+def _needed(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
+
+
 def fill(
-    template: str, figures: dict[str, Any], data: dict[str, Any], scenario: Scenario, parameters: str,
+    name: str, figures: dict[str, Any], data: dict[str, Any], scenario: Scenario, parameters: str,
     more: dict[str, Any] | None = None, **content: Any,
 ) -> str:  # fmt: skip
     """A template of this folder, filled. Raises UserError if plotly or jinja2 is not installed.
@@ -115,15 +129,10 @@ def fill(
     `figures` go to plotly.js by the key of their place in the page, `data` is what the page offers to save,
     `parameters` the params file of the scenario; scripts find what is in `more` beside the figures.
     """
-    try:
-        jinja2: Any = importlib.import_module("jinja2")
-        plotly: Any = importlib.import_module("plotly.offline")
-    except ImportError as error:
-        raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    page = template(name)
+    plotly: Any = _needed("plotly.offline")
     # Library and figures are packed, and the data is a script: JSON in which nothing can end it.
-    text: str = environment.get_template(template).render(
+    text: str = page.render(
         library=_library(plotly.get_plotlyjs),
         packed=packed_figures({"figures": figures, **(more or {})}),
         data=_for_script(data),

@@ -103,15 +103,15 @@ CLAIMS = (
         measurements.final_errors, lambda values: holds_if(max(values.values()) < 0.01),
     ),
     Claim(
-        "discretisation", "III, eq. 20", "For a small T_s Euler's step approximates the motion of the AGV.",
+        "discretisation", "III, eq. 15", "For a small T_s Euler's step approximates the motion of the AGV.",
         measurements.discretisation, lambda values: holds_if(max(values.values()) < 0.01),
     ),
     Claim(
-        "error_dynamics", "IV, eq. 365",
-        "Substituting the control rule into eq. 400 gives eq. 365 (here: slope of d theta_e/dt over row 3).",
+        "error_dynamics", "IV, eq. 20",
+        "Substituting the control rule into eq. 22 gives eq. 20 (here: slope of d theta_e/dt over row 3).",
         measurements.error_rates,
         lambda values: holds_if(
-            abs(values["of eq. 365"] - 1.0) < CLOSE, "the bracket of row 3 needs a minus sign: a misprint"
+            abs(values["of eq. 20"] - 1.0) < CLOSE, "the bracket of row 3 needs a minus sign: a misprint"
         ),
     ),
     Claim(
@@ -136,7 +136,7 @@ CLAIMS = (
         ),
     ),
     Claim(
-        "criterion_sufficient", "IV, eq. 55, 56; VI",
+        "criterion_sufficient", "IV, eq. 21, 24; VI",
         "The loop is stable under n_ul outages if all eigenvalues of A(k) are below 1.",
         measurements.outage_test, _judge_outage_test,
     ),
@@ -146,7 +146,7 @@ CLAIMS = (
         lambda values: holds_if(min(values.values()) < 1.0 < max(values.values())),
     ),
     Claim(
-        "eigenvalues_on_curves", "IV, eq. 55; VI", "The eigenvalues of A(k) depend on n_ul: on a curved track.",
+        "eigenvalues_on_curves", "IV, eq. 21; VI", "The eigenvalues of A(k) depend on n_ul: on a curved track.",
         lambda runs: measurements.outages_on("paper"),
         lambda values: holds_if(
             _differ(values),
@@ -155,14 +155,14 @@ CLAIMS = (
         ),
     ),
     Claim(
-        "eigenvalues_on_a_line", "IV, eq. 55; VI", "The eigenvalues of A(k) depend on n_ul: on a straight track.",
+        "eigenvalues_on_a_line", "IV, eq. 21; VI", "The eigenvalues of A(k) depend on n_ul: on a straight track.",
         lambda runs: measurements.outages_on("line"),
         lambda values: holds_if(
             _differ(values), "theta_c(k) is theta_c(k - n) there, and n_ul enters through the turn between them alone"
         ),
     ),
     Claim(
-        "criterion_necessary", "IV, eq. 56", "Stability needs 0 < |lambda|.",
+        "criterion_necessary", "IV, eq. 24", "Stability needs 0 < |lambda|.",
         measurements.deadbeat,
         lambda values: holds_if(
             values["smallest |lambda|"] > 1e-9 or values["to 1 cm [steps]"] is None,

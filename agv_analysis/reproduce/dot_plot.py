@@ -6,7 +6,6 @@ As wide as a column of a paper, SVG and PNG, with the whole table as CSV beside 
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 from agv_analysis.output_file import not_linked_out, save_figure
 from agv_analysis.reproduce.claim import Values
 from agv_analysis.reproduce.figures import STYLE, WIDTH
-from agv_analysis.reproduce.report import Table, text_of
+from agv_analysis.reproduce.report import DIVERGED, Table, text_of
 from agv_ros.errors import UserError
 
 _WIDE = 100.0
@@ -41,14 +40,24 @@ def write(table: Table, folder: Path) -> None:
 
 
 def _draw(axes: Any, table: Table) -> None:
-    """`axes` is a matplotlib Axes. What did not happen, or is infinite, has no dot."""
+    """`axes` is a matplotlib Axes. What did not happen has no dot, what diverges an open one at the right edge."""
     from matplotlib.ticker import NullLocator, SymmetricalLogLocator
 
     shown: list[float] = []
     for marker, column in zip(_MARKERS, table.drawn, strict=False):
         values = [(value, i) for i, row in enumerate(table.rows) if (value := _number(row[column])) is not None]
         shown += [value for value, _ in values]
-        axes.plot([x for x, _ in values], [i for _, i in values], marker, label=column, ms=4.0, alpha=0.8)
+        (dots,) = axes.plot([x for x, _ in values], [i for _, i in values], marker, label=column, ms=4.0, alpha=0.8)
+        beyond = [i for i, row in enumerate(table.rows) if text_of(row[column]) == "diverges"]
+        if beyond:
+            axes.set_xlabel("open, at the right edge: diverges")
+            at_edge = {
+                "transform": axes.get_yaxis_transform(),
+                "clip_on": False,
+                "mfc": "none",
+                "mec": dots.get_color(),
+            }
+            axes.plot([1.0] * len(beyond), beyond, marker, ms=4.0, **at_edge)
     names = list(table.rows[0])[: table.named]
     axes.set_yticks(range(len(table.rows)), [", ".join(text_of(row[name]) for name in names) for row in table.rows])
     axes.set_ylabel(", ".join(names))
@@ -66,7 +75,7 @@ def _draw(axes: Any, table: Table) -> None:
 
 
 def _number(value: object) -> float | None:
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < DIVERGED
     return float(value) if is_number else None  # type: ignore[arg-type]
 
 

@@ -45,7 +45,13 @@ class Figure:
     linear_to: float = math.inf
     """Size beyond which the y axis is logarithmic."""
     where: str = ""
-    """Which figure of the paper it is, and its caption; in the title of the files."""
+    """Which figure of the paper it is, and its caption, as in `Fig. 3a: tracks`; in the title of the files."""
+
+    @property
+    def file_name(self) -> str:
+        """Name of its files without ending: `fig_3a_unlimited_tracks`."""
+        number = self.where.partition(":")[0].removeprefix("Fig. ")
+        return f"fig_{number}_{self.name}"
 
 
 def figures(runs: Runs) -> Iterator[Figure]:
@@ -58,7 +64,7 @@ def figures(runs: Runs) -> Iterator[Figure]:
     yield Figure("reference_speed", "time [s]", "v_r [m/s]", curve, where="Fig. 2b: reference translational velocity")
     for name, v_max, letters in (("unlimited", math.inf, "abc"), ("limited", LIMIT, "def")):
         tracks_of, error_of, speed_of = (f"Fig. 3{letter}: " for letter in letters)
-        by_gain = {f"K_x = {kx:g}": runs.run(*gain(kx, v_max)) for kx in GAINS}
+        by_gain = {f"K_x = {kx:g} 1/s": runs.run(*gain(kx, v_max)) for kx in GAINS}
         tracks = {label: (run.pose[:, 0], run.pose[:, 1]) for label, run in by_gain.items()}
         yield Figure(f"{name}_tracks", "x [m]", "y [m]", tracks, is_map=True, where=f"{tracks_of}tracks, {name} speed")
         errors = _begin(by_gain, _y_error)
@@ -96,11 +102,11 @@ def write(figure: Figure, folder: Path) -> None:
         if len(figure.curves) > 1:
             axes.legend()
         try:
-            save_figure(canvas, folder / f"{figure.name}.svg", figure.where)
-            save_figure(canvas, folder / f"{figure.name}.png", figure.where, dpi=300)
-            _write_csv(figure, folder / f"{figure.name}.csv")
+            save_figure(canvas, folder / f"{figure.file_name}.svg", figure.where)
+            save_figure(canvas, folder / f"{figure.file_name}.png", figure.where, dpi=300)
+            _write_csv(figure, folder / f"{figure.file_name}.csv")
         except OSError as error:
-            raise UserError(f"{folder / figure.name}: cannot be written: {error.strerror}") from None
+            raise UserError(f"{folder / figure.file_name}: cannot be written: {error.strerror}") from None
 
 
 def _write_csv(figure: Figure, path: Path) -> None:

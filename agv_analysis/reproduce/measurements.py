@@ -66,13 +66,13 @@ def zero_under_outages(runs: Runs) -> Values:
 
 
 def error_rates(runs: Runs) -> Values:
-    """Least-squares slope of the measured d theta_e/dt over the bracket of eq. 365, and over eq. 400."""
+    """Least-squares slope of the measured d theta_e/dt over the bracket of eq. 20, and over eq. 22."""
     run = runs.run("plant.initial_pose=[1.0, 0.0, 1.8]", "plant.duration=5.0")
     theta_e, v_r, gains = run.error[:, 2], run.reference[:, 3], run.scenario.controller
     rate = np.diff(theta_e) / run.ts
     printed = (v_r * (gains.ky * run.error[:, 1] + gains.ktheta * np.sin(theta_e)))[:-1]
     original = (run.reference[:, 4] - run.command[:, 1])[:-1]
-    return {"of eq. 365": _slope(rate, printed), "of eq. 400": _slope(rate, original)}
+    return {"of eq. 20": _slope(rate, printed), "of eq. 22": _slope(rate, original)}
 
 
 def _slope(y: Floats, x: Floats) -> float:

@@ -10,12 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from agv_analysis.output_file import JSON_MARK, MARKDOWN_MARK, not_linked_out
+from agv_analysis.reproduce.citation import ARXIV, AUTHORS, DOI, TITLE
 from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding, Values
 from agv_analysis.version import version
 from agv_ros.errors import UserError
 
 _ROUNDING = 1e-9
 """Below this a measured value differs between machines."""
+
+DIVERGED = 1e9
+"""From this size on a measured value says nothing but that the loop diverges."""
 
 _COLOURS = {HOLDS: "green", REMARK: "yellow", PART: "yellow", FAILS: "red"}
 
@@ -34,11 +38,16 @@ class Table:
 
 
 def text_of(value: Any) -> str:
-    """A measured value for people: four digits, 0 for what is rounding, `never` for what did not happen."""
+    """A measured value for people: four digits, 0 for what is rounding, `never` for what did not happen.
+
+    `diverges`: no finite number, or one beyond DIVERGED.
+    """
     if value is None:
         return "never"
     if not isinstance(value, float):
         return str(value)
+    if not abs(value) < DIVERGED:
+        return "diverges"
     return "0" if abs(value) < _ROUNDING else f"{value:.4g}"
 
 
@@ -141,6 +150,7 @@ def to_json(findings: Sequence[Finding], tables: Sequence[Table], source: str) -
     ]
     return {
         "version": version(),
+        "paper": {"authors": AUTHORS, "title": TITLE, "arxiv": ARXIV, "doi": DOI},
         "source": source,
         "claims": claims,
         "future_work": {table.key: [_finite(row) for row in table.rows] for table in tables},

@@ -1,4 +1,4 @@
-"""The paper's test: eigenvalues of A(k) (eq. 55) at every step, |lambda| < 1 (eq. 56).
+"""The paper's test: eigenvalues of A(k) (eq. 21) at every step, |lambda| < 1 (eq. 24).
 
 A(k) sums the Jacobians of X_c(k+1) with respect to X_c(k) and to X_c(k-n): it treats the outdated pose as if it were
 the current one. With mu = 1 - lambda and Delta = theta_c(k) - theta_c(k-n) its characteristic polynomial is
@@ -6,7 +6,7 @@ the current one. With mu = 1 - lambda and Delta = theta_c(k) - theta_c(k-n) its 
     mu^3 - (a cos Delta + b) mu^2 + (a b + c) cos Delta mu - a c = 0,  a = T_s K_x, b = T_s v K_theta, c = T_s^2 v^2 K_y
 
 with v = v_r(k-n). So the outdated pose enters through Delta alone, and on a straight track not at all. The literal
-eq. 55 has the commanded speed nu(k-n) instead of v_r(k-n) in A(3,2); `v_literal` keeps that form.
+eq. 21 has the commanded speed nu(k-n) instead of v_r(k-n) in A(3,2); `v_literal` keeps that form.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def matrices(
     ts: float,
     v_literal: Floats | None = None,
 ) -> Floats:
-    """A(k) of eq. 55, shape (N, 3, 3).
+    """A(k) of eq. 21, shape (N, 3, 3).
 
     theta = theta_c(k) and theta_held = theta_c(k-n) [rad], v_held = v_r(k-n) [m/s], all of shape (N,); v_literal =
     nu(k-n) [m/s] where A(3,2) shall be as printed.

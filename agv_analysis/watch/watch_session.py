@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agv_analysis.explore.background_criteria import LatestOnlyWorker, WorkerDiedError
 from agv_analysis.scenario import Scenario
 from agv_analysis.watch.controls import controls_of
+from agv_analysis.watch.foxglove_server import Send
 from agv_analysis.watch.link_margin import LinkMargin, link_margin
 from agv_analysis.watch.live_loop import DIAGNOSTICS, MINUTES, LiveLoop
 from agv_analysis.watch.live_tiles import live_tiles
@@ -51,10 +52,13 @@ class WatchSession:
 
     def __init__(
         self, watcher: WatcherNode, remote: RemoteParameters, scenario: Scenario | None, folder: Path,
-        stop: Callable[[], None] | None,
+        stop: Callable[[], None] | None, send: Send | None = None,
     ) -> None:  # fmt: skip
-        """`scenario`: None if the nodes are to be asked. `stop` ends the run, None if that is not ours to end."""
-        self.watcher, self.folder, self.stop = watcher, folder, stop
+        """`scenario`: None if the nodes are to be asked. `stop` ends the run, None if that is not ours to end.
+
+        `send` receives all messages, too.
+        """
+        self.watcher, self.folder, self.stop, self._send = watcher, folder, stop, send
         self.log = MessageLog(60.0 * MINUTES)
         self.loop: LiveLoop | None = None
         self.changed = threading.Condition()
@@ -109,6 +113,8 @@ class WatchSession:
     def tick(self) -> None:
         """Take in what has come, and let the page have it."""
         heard = self.watcher.drain()
+        if self._send is not None:
+            self._send(self.watcher.names(), self.watcher.types(), heard)
         with self.changed:
             self.log.add(heard)
             for message in heard:

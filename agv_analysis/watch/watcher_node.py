@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import rclpy
@@ -24,6 +25,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import TimeReference
 
 from agv_analysis.scenario import load_scenario
+from agv_analysis.watch.foxglove_server import foxglove_served
 from agv_analysis.watch.live_loop import DIAGNOSTICS, TOPICS
 from agv_analysis.watch.message_log import Heard
 from agv_analysis.watch.remote_parameters_node import RemoteParameters
@@ -141,23 +143,27 @@ class WatcherNode:
 
 def watch(
     namespace: str, config: Path | None, domains: tuple[int, int], folder: Path, where: tuple[str, int],
-    ready: Callable[[str], None], stop_run: Callable[[], None] | None,
+    ready: Callable[[str, str], None], stop_run: Callable[[], None] | None, foxglove_port: int | None = None,
 ) -> None:  # fmt: skip
-    """Serve the page of a namespace's loop at host and port `where`; `ready` is told its address.
+    """Serve the page of a namespace's loop at host and port `where`; `ready` receives its address.
 
     `domains` are the DDS domains of AGV and edge, negative: the usual one. `stop_run` ends the run that the page
-    belongs to. Raises UserError if the params file, host or port cannot be used.
+    belongs to. With a `foxglove_port` a server for Foxglove stands beside the page, and `ready` receives its address as
+    well, which is empty otherwise. Raises UserError if the params file, host or a port cannot be used.
     """
     if where[0] in EVERYWHERE:
         raise UserError(f"--host {where[0]!r} names no address: name the one by which others reach this machine")
     scenario = None if config is None else load_scenario(str(config))
-    with stop_on_signals() as stop:
+    with stop_on_signals() as stop, ExitStack() as servers:
+        to_foxglove, send = "", None
+        if foxglove_port is not None:
+            to_foxglove, send = servers.enter_context(foxglove_served(foxglove_port))
         watcher = WatcherNode(namespace, *domains)
         remote = RemoteParameters(watcher.agv, watcher.edge)
-        session = WatchSession(watcher, remote, scenario, folder, stop_run)
+        session = WatchSession(watcher, remote, scenario, folder, stop_run, send)
         try:
             with served(session, *where) as address:
-                ready(address)
+                ready(address, to_foxglove)
                 _listen(session, lambda: stop.requested)
                 session.end()
         finally:

@@ -18,7 +18,7 @@ def kanayama(
     ky: Annotated[float, Quantity("gain K_y of the error across the track", "1/m^2", low=0.0, high=1e6)] = 1.0,
     ktheta: Annotated[float, Quantity("gain K_theta of the error of heading", "1/m", low=0.0, high=1e6)] = 2.0,
 ) -> tuple[float, float]:
-    """Command (v [m/s], w [rad/s]) from the tracking error and the reference's speeds (the paper's eq. 15).
+    """Command (v [m/s], w [rad/s]) from the tracking error and the reference's speeds (the paper's eq. 4).
 
         v = v_r cos(theta_e) + K_x x_e
         w = w_r + v_r (K_y y_e + K_theta sin(theta_e))

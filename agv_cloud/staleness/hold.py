@@ -7,7 +7,7 @@ from agv_ros.pose import Pose
 
 
 def hold(held: Pose, target: Pose, reference: ReferencePoint) -> tuple[Pose, Pose]:
-    """X_r(k) against X_c(k-n) (the paper's eq. 1000).
+    """X_r(k) against X_c(k-n) (the paper's eq. 16).
 
     Zero error is no equilibrium: the AGV runs ahead by v_r n T_s.
     """

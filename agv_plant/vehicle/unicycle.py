@@ -11,7 +11,7 @@ import math
 
 
 def euler_step(x: float, y: float, theta: float, v: float, w: float, ts: float) -> tuple[float, float, float]:
-    """X(k+1) = X(k) + T_s [v cos theta, v sin theta, w] (the paper's eq. 20).
+    """X(k+1) = X(k) + T_s [v cos theta, v sin theta, w] (the paper's eq. 15).
 
     The reference track is made by this same function, so that a perfect start stays perfect to the last bit.
     """

@@ -20,7 +20,7 @@ posture = st.tuples(place, place, angle)
 @settings(deadline=None, derandomize=True)
 @given(posture, posture)
 def test_the_matrix_form_of_the_paper(r: tuple[float, float, float], c: tuple[float, float, float]) -> None:
-    # Equation 10: eps = T_e (X_r - X_c).
+    # Equation 3: eps = T_e (X_r - X_c).
     theta = c[2]
     T_e = np.array(
         [[np.cos(theta), np.sin(theta), 0.0], [-np.sin(theta), np.cos(theta), 0.0], [0.0, 0.0, 1.0]], dtype=np.float64

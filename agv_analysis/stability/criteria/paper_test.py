@@ -25,7 +25,7 @@ from agv_analysis.stability.criteria.criterion import (
 from agv_analysis.stability.derived_loop import is_kanayamas_law
 from agv_plant.vehicle.registry import UNICYCLE
 
-_OTHER_LOOP = "no answer: eq. 55 is of Kanayama's law on a unicycle"
+_OTHER_LOOP = "no answer: eq. 21 is of Kanayama's law on a unicycle"
 
 
 @dataclass(frozen=True)
@@ -44,19 +44,19 @@ class PaperTest:
 
 
 def applies_to(scenario: Scenario) -> bool:
-    """Is it the law and the vehicle that eq. 55 was written for?"""
+    """Is it the law and the vehicle that eq. 21 was written for?"""
     return scenario.plant.vehicle == UNICYCLE and is_kanayamas_law(scenario)
 
 
 def paper_test(run: Run) -> PaperTest:
-    """The paper's test (eq. 55, 56) with the headings, speeds and outages of a run."""
+    """The paper's test (eq. 21, 24) with the headings, speeds and outages of a run."""
     radii = paper.spectral_radii(*paper_inputs(run), run.scenario.controller, run.ts)
     worst = int(np.argmax(radii))
     return PaperTest(float(radii[worst]), int(run.k[worst]))
 
 
 def paper_inputs(run: Run) -> tuple[Floats, Floats, Floats]:
-    """What A(k) of eq. 55 depends on at each step: theta_c(k), theta_c(k-n) [rad], v_r(k-n) [m/s], each of shape (N,).
+    """What A(k) of eq. 21 depends on at each step: theta_c(k), theta_c(k-n) [rad], v_r(k-n) [m/s], each of shape (N,).
 
     Where the pose that the edge held is missing from the recording the oldest one before it stands for it.
     """
@@ -113,7 +113,7 @@ CRITERION = Criterion(
     key="paper",
     order=10,
     title="The paper's test",
-    asks="Are all eigenvalues of A(k) (eq. 55) inside the unit circle at every step?",
+    asks="Are all eigenvalues of A(k) (eq. 21) inside the unit circle at every step?",
     assumes="That the outdated pose is the current one; so on a straight track it cannot see outages at all.",
     judge=_judge,
     margins=_margins,

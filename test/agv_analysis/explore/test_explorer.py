@@ -267,7 +267,7 @@ def test_the_counterexample_is_a_pose_that_is_always_as_old(base: Scenario) -> N
     run = simulate(scenario)
     assert set(run.n_ul[20:].tolist()) == {13}
     assert not run.lost.any()
-    # the eigenvalues that the preset's text names, of the closed loop with a fresh pose: 1 - a, and (eq. 55) with
+    # the eigenvalues that the preset's text names, of the closed loop with a fresh pose: 1 - a, and (eq. 21) with
     # b = T_s v K_theta, c = T_s^2 v^2 K_y the roots of mu^2 - b mu + c, of which they are 1 - mu
     gains, v = scenario.controller, run.reference[-1, 3]
     b, c = 0.005 * v * gains.ktheta, (0.005 * v) ** 2 * gains.ky

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import importlib.util
 import json
 import math
@@ -18,6 +19,7 @@ import pytest
 from agv_analysis.reproduce import constant_delay
 from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding, check
 from agv_analysis.reproduce.claims import CLAIMS, ON_TRACK
+from agv_analysis.reproduce.claims_page import PAGE, SHOWN_IN
 from agv_analysis.reproduce.figures import figures, write
 from agv_analysis.reproduce.future import settling_across
 from agv_analysis.reproduce.report import text_of
@@ -314,8 +316,8 @@ def test_the_time_constants_are_those_of_the_sampled_loop(findings: dict[str, Fi
 
 
 def test_row_3_of_the_error_dynamics_has_the_wrong_sign(findings: dict[str, Finding]) -> None:
-    assert findings["error_dynamics"].measured["of eq. 365"] == pytest.approx(-1.0, abs=1e-9)
-    assert findings["error_dynamics"].measured["of eq. 400"] == pytest.approx(1.0, abs=1e-9)
+    assert findings["error_dynamics"].measured["of eq. 20"] == pytest.approx(-1.0, abs=1e-9)
+    assert findings["error_dynamics"].measured["of eq. 22"] == pytest.approx(1.0, abs=1e-9)
 
 
 def test_under_outages_the_agv_runs_ahead_by_the_mean_age(findings: dict[str, Finding]) -> None:
@@ -382,7 +384,15 @@ def test_other_values_refute_a_claim(key: str) -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "never"), (3, "3"), ("over", "over"), (-24.5, "-24.5"), (1e-31, "0"), (0.000615, "0.000615")],
+    [
+        (None, "never"),
+        (3, "3"),
+        ("over", "over"),
+        (-24.5, "-24.5"),
+        (1e-31, "0"),
+        (1e196, "diverges"),
+        (0.000615, "0.000615"),
+    ],
 )
 def test_values_as_people_read_them(value: Any, text: str) -> None:
     assert text_of(value) == text
@@ -399,13 +409,13 @@ def test_figures_are_a_column_wide_and_carry_their_data(tmp_path: Path) -> None:
     ]  # fmt: skip
     figure = next(figure for figure in drawn if figure.name == "limited_speed")
     write(figure, tmp_path)
-    width, _ = struct.unpack(">II", (tmp_path / "limited_speed.png").read_bytes()[16:24])
+    width, _ = struct.unpack(">II", (tmp_path / "fig_3f_limited_speed.png").read_bytes()[16:24])
     assert width == 1050  # 3.5 in at 300 dots an inch
-    root = ElementTree.parse(tmp_path / "limited_speed.svg").getroot()
+    root = ElementTree.parse(tmp_path / "fig_3f_limited_speed.svg").getroot()
     assert root.attrib["width"] == "252pt"
-    assert "Fig. 3f: translational velocity, limited" in (tmp_path / "limited_speed.svg").read_text()
+    assert "Fig. 3f: translational velocity, limited" in (tmp_path / "fig_3f_limited_speed.svg").read_text()
     assert not root.findall(".//{http://www.w3.org/2000/svg}text"), "letters are paths"
-    rows = list(csv.reader((tmp_path / "limited_speed.csv").open()))
+    rows = list(csv.reader((tmp_path / "fig_3f_limited_speed.csv").open()))
     assert [float(row[1]) for row in rows[1:]] == runs.run(*gain(5.0, 6.0)).command[: len(rows) - 1, 0].tolist()
 
 
@@ -425,6 +435,18 @@ def test_the_command_writes_everything(made: Made) -> None:
     for suffix in ("svg", "png", "csv"):
         assert len(list(made.folder.glob(f"*.{suffix}"))) == 8 + 9
     assert (made.folder / "future.md").read_text().count("###") == len(made.content["future_work"]) == 9
+    assert made.content["paper"]["arxiv"] in (REPOSITORY / "CITATION.cff").read_text()
+
+
+def test_the_page_has_every_claim_once_beside_its_figure(made: Made) -> None:
+    page = html.unescape((made.folder / PAGE).read_text())
+    assert page.count("<img") == page.count("data:image/png;base64,") == 8 + 9
+    for claim in made.content["claims"]:
+        assert page.count(f"<td>{claim['claim']}</td>") == 1
+    assert {key for keys in SHOWN_IN.values() for key in keys} < set(EXPECTED)
+    _, _, behind = page.partition("Fig. 3b: ")
+    assert behind.index("1/K_x is the time constant") < behind.index("Fig. 3c: ")
+    assert "e+1" not in page.partition("future work")[2]
 
 
 def test_a_directory_that_cannot_be_made_is_one_line(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:

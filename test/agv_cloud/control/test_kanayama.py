@@ -25,7 +25,7 @@ gain = st.floats(0.0, 300.0)
 def test_the_matrix_form_of_the_paper(
     x_e: float, y_e: float, theta_e: float, v_r: float, w_r: float, kx: float, ky: float, ktheta: float
 ) -> None:
-    # Equation 15 as u = u_ff + K eps' with eps' = (x_e, y_e, sin theta_e).
+    # Equation 4 as u = u_ff + K eps' with eps' = (x_e, y_e, sin theta_e).
     feed_forward = np.array([v_r * np.cos(theta_e), w_r])
     K = np.array([[kx, 0.0, 0.0], [0.0, v_r * ky, v_r * ktheta]])
     expected = feed_forward + K @ np.array([x_e, y_e, np.sin(theta_e)])
@@ -58,7 +58,7 @@ def test_each_error_is_steered_against(which: int, sign: tuple[int, int]) -> Non
 @settings(deadline=None, derandomize=True, max_examples=30)
 @given(st.floats(0.2, 3.0), st.floats(-1.0, 1.0), st.floats(1.0, 100.0), st.floats(0.1, 5.0), st.floats(0.1, 5.0))
 def test_the_linearised_error_dynamics_of_kanayama(v_r: float, w_r: float, kx: float, ky: float, ktheta: float) -> None:
-    # Equation 400 with the law put in, at eps = 0; Kanayama et al. 1990, eq. 14, is its Jacobian.
+    # Equation 22 with the law put in, at eps = 0; Kanayama et al. 1990, eq. 14, is its Jacobian.
     def derivative(eps: NDArray[np.float64]) -> NDArray[np.float64]:
         x_e, y_e, theta_e = eps
         v, w = kanayama(x_e, y_e, theta_e, v_r, w_r, kx, ky, ktheta)

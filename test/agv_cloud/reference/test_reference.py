@@ -21,7 +21,7 @@ Point = tuple[float, float, float, float, float]
 
 
 def recursion(parameters: ErrorDetectorParameters, steps: int) -> list[Point]:
-    """Equation 20 of the paper with u = (v_r, w_r), written out."""
+    """Equation 15 of the paper with u = (v_r, w_r), written out."""
     n, ts = round(parameters.lap_time / parameters.ts), parameters.ts
     x, y, theta = parameters.track_start
     points = []
