@@ -58,12 +58,12 @@ def test_a_client_gets_the_messages_of_the_loop_as_they_are_in_the_bag(start: St
             elif message[0] == MESSAGE_DATA:
                 subscription, _ = struct.unpack_from("<IQ", message, 1)
                 value = WANTED[names[subscription]](message[13:])
-                heard[names[subscription]][value[0]] = value
+                heard[names[subscription]][int(value[0])] = value
     status, said = loop.end(120.0)
     assert status == 0, said
     bag = read_bag(tmp_path / "bag", topics=list(WANTED))
     for topic, values in heard.items():
-        recorded = {decoded[0]: decoded for decoded in map(WANTED[topic], bag.payloads(topic))}
+        recorded = {int(decoded[0]): decoded for decoded in map(WANTED[topic], bag.payloads(topic))}
         assert {stamp: recorded.get(stamp) for stamp in values} == values
     assert announced["/agv/pose"]["encoding"] == "cdr"
     assert announced["/agv/pose"]["schemaName"] == "geometry_msgs/msg/PoseStamped"
