@@ -75,7 +75,7 @@ def render(analysis: Observations, within: CorridorOfRun | None = None) -> str:
     return fill(
         "report.html.j2",
         figures={key: figure(group) for key, _, group in _groups(drawn)},
-        more={"cursor": _cursor(run)},
+        more={"cursor": _cursor(run) | ({} if within is None else _lap_of(within))},
         scenario=run.scenario,
         data=report_json(analysis, drawn) | ({} if within is None else {"corridor": within.to_json()}),
         title=f"agv_ncs: {run.source}",
@@ -155,6 +155,11 @@ def _cursor(run: Run) -> dict[str, Any]:
     some = slice(None, None, -(-len(run) // _CURSOR_PLACES))
     x, y = within_reach(run)
     return {name: packed_values(values[some]) for name, values in (("time", run.time), ("x", x), ("y", y))}
+
+
+def _lap_of(within: CorridorOfRun) -> dict[str, float]:
+    """Time of a lap [s], by which the panel of the corridor is drawn, if there is one."""
+    return {} if within.expected is None else {"lap": len(within.expected.lap) * within.expected.ts}
 
 
 def report_json(analysis: Observations, drawn: list[Panel]) -> dict[str, Any]:
