@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.requirements.availability import packets_for
 from agv_analysis.requirements.link_availability import LinkAvailability
 from agv_analysis.requirements.loop_requirements import LoopRequirements
 from agv_analysis.requirements.service_classes import ServiceClass
@@ -27,7 +28,7 @@ def meets(wanted: ServiceClass, link: LinkAvailability | None) -> Answer:
     if wanted.availability is not None:
         answers.append(_at_most("unavailability", link.unavailability, 1.0 - wanted.availability, link))
     if wanted.mtbf_s is not None:
-        answers.append(_at_least(link.mtbf, wanted.mtbf_s))
+        answers.append(_at_least(link.mtbf, wanted.mtbf_s, link))
     if wanted.largest_loss is not None:
         answers.append(_at_most("loss rate", link.loss_rate, wanted.largest_loss, link))
     if wanted.latency_s is not None:
@@ -77,15 +78,39 @@ def _at_most(name: str, seen: Estimate, limit: float, link: LinkAvailability) ->
         return YES, said
     if seen.low > limit:
         return NO, said
-    more = link.more_packets(1.0 - limit) if name == "unavailability" else None
-    return CANNOT_TELL, said if more is None else f"{said}: {more} packets more without a failure would show it"
+    return CANNOT_TELL, said + ("" if seen.value else _how_much_longer(link, limit))
 
 
-def _at_least(seen: Estimate, limit: float) -> Answer:
+def _at_least(seen: Estimate, limit: float, link: LinkAvailability) -> Answer:
     said = f"mean time between failures {seen.value:.4g} s" if math.isfinite(seen.value) else "no failure"
-    said += f" ({seen.low:.4g} s to {seen.high:.4g} s)" if seen.low < seen.high else ""
+    upto = f"{seen.high:.4g} s" if math.isfinite(seen.high) else "no end"
+    said += f" ({seen.low:.4g} s to {upto})" if seen.low < seen.high else ""
     said += f", at least {limit:.4g} s"
-    return (YES if seen.low >= limit else NO if seen.high < limit else CANNOT_TELL), said
+    if seen.low >= limit or seen.high < limit:
+        return (YES if seen.low >= limit else NO), said
+    # A share h of the packets that fail makes a mean time of interval (1 - h) / h between failures.
+    more = "" if link.interval is None else _how_much_longer(link, link.interval / (limit + link.interval))
+    return CANNOT_TELL, said + ("" if math.isfinite(seen.value) else more)
+
+
+def _how_much_longer(link: LinkAvailability, share: float) -> str:
+    """How many packets without a failure show that no larger share of them fails."""
+    if link.packets is None or not share > 0.0:
+        return ""
+    needed = packets_for(1.0 - share)
+    time = "" if link.interval is None else f", {_duration((needed - link.packets) * link.interval)} more"
+    return f": to show it takes {_grouped(needed)} clean packets at 95 %, and there are {_grouped(link.packets)}{time}"
+
+
+def _grouped(count: int) -> str:
+    return f"{count:,}".replace(",", " ")
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds:.3g} s"
 
 
 def _latency(seen: float | None, limit: float) -> Answer:

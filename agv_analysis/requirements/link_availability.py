@@ -10,7 +10,7 @@ import numpy as np
 
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
-from agv_analysis.link.link_figures import LinkFigures
+from agv_analysis.link.link_figures import ROUND_TRIP, LinkFigures
 from agv_analysis.link.markov_channel import Chain, gilbert_elliott
 from agv_analysis.link.reception_intervals import reception_intervals
 from agv_analysis.link.transitions import count_transitions, interval_of
@@ -34,6 +34,8 @@ class LinkAvailability:
     packets: int | None = None
     """That were seen; None for a channel."""
     assumption: str = ""
+    interval: float | None = None
+    """Time between packets [s]; None for a channel."""
 
     @property
     def availability(self) -> Estimate:
@@ -109,6 +111,8 @@ def of_measurement(figures: LinkFigures, survival: float) -> LinkAvailability:
     else:
         unavailability = _of_failures(share, excess[excess > 0.0], rate, packets)
         assumption = "failures are taken for independent of each other; no model of the losses between them"
+    if direction.name == ROUND_TRIP:
+        assumption += "; they are of round trips, since on which way a packet was lost is not known"
     up = packets - float(excess.sum())
     mtbf = Estimate.about(
         interval * up / failures if failures else math.inf,
@@ -117,8 +121,8 @@ def of_measurement(figures: LinkFigures, survival: float) -> LinkAvailability:
     )
     spread = figures.whole.delay
     return LinkAvailability(
-        unavailability, mtbf, direction.fit.loss_rate, None if spread is None else spread.percentiles[-1], failures,
-        packets, assumption,
+        unavailability, mtbf, direction.loss_rate or direction.fit.loss_rate,
+        None if spread is None else spread.percentiles[-1], failures, packets, assumption, interval,
     )  # fmt: skip
 
 

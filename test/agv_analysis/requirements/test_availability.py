@@ -11,7 +11,9 @@ from agv_analysis.link.link_figures import LinkFigures
 from agv_analysis.link.markov_channel import Chain, bernoulli, gilbert_elliott
 from agv_analysis.link.measurement import Measurement, PacketOutcomes
 from agv_analysis.requirements.availability import availability_of, packets_for
+from agv_analysis.requirements.class_check import CANNOT_TELL, YES, meets
 from agv_analysis.requirements.link_availability import of_measurement
+from agv_analysis.requirements.service_classes import ServiceClass
 from agv_analysis.run import Floats
 
 TS = 0.005
@@ -108,3 +110,27 @@ def test_a_measurement_without_a_failure() -> None:
     assert failed.failures == 1
     assert failed.unavailability.value == pytest.approx(1 / 60_000)
     assert failed.more_packets(1.0 - 1e-6) is None
+
+
+def test_how_much_longer_to_measure_a_link_that_never_failed() -> None:
+    found = of_measurement(figures(np.zeros(60_000), 0.005), 0.07)
+    assert found.loss_rate.high == found.unavailability.high == pytest.approx(3.0 / 60_000, rel=2e-3)
+    for wanted in (a_class(availability=1.0 - 1e-6), a_class(loss_rate=1e-6)):
+        answer, why = meets(wanted, found)
+        assert answer == CANNOT_TELL
+        assert "to show it takes 2 995 731 clean packets at 95 %, and there are 60 000, 4.08 h more" in why
+    assert meets(a_class(loss_rate=1e-4), found)[0] == YES
+    answer, why = meets(a_class(mtbf_s=600.0), found)
+    assert (answer, "(100.1 s to no end)" in why) == (CANNOT_TELL, True)
+    needed = int(why.split("takes ")[1].split(" clean")[0].replace(" ", ""))
+    assert of_measurement(figures(np.zeros(needed), 0.005), 0.07).mtbf.low == pytest.approx(600.0, rel=1e-5)
+
+
+def test_what_is_of_round_trips_is_said_to_be() -> None:
+    outcome = np.zeros(1000, dtype=np.int8)
+    trips = Measurement("x", "ping", 0.02 * np.arange(1000.0), round_trip=PacketOutcomes(outcome))
+    assert "they are of round trips" in of_measurement(LinkFigures(trips), 0.06).assumption
+
+
+def a_class(**wanted: float) -> ServiceClass:
+    return ServiceClass("x", "service", "D", "T", "1", True, **wanted)  # type: ignore[arg-type]
