@@ -77,11 +77,12 @@ def _read(path: Path, options: Options) -> Measurement:
 def _read_block(block: Block, found: _Found, path: Path) -> None:
     text, last = block.text, len(block.text) - 1
     signs = np.flatnonzero((text == ord("=")) | (text == ord("<")))
-    at_seq = signs[is_preceded_by(text, signs, b"seq")]
-    at_ttl = signs[is_preceded_by(text, signs, b" ttl") | is_preceded_by(text, signs, b" hlim")]
+    is_seq = is_preceded_by(text, signs, b"seq")
+    is_ttl = is_preceded_by(text, signs, b" ttl") | is_preceded_by(text, signs, b" hlim")
+    at_seq, at_ttl, others = signs[is_seq], signs[is_ttl], signs[~is_seq & ~is_ttl]
     lines = len(block.starts)
     line_of_seq = block.line_of(at_seq)
-    rtt = _milliseconds(block, signs + 1, lines)
+    rtt = _milliseconds(block, others + 1, lines)
     first = _after_stamp(block)
     stamped = text[block.starts] == ord("[")
     stamp = np.full(lines, np.nan)
