@@ -101,8 +101,8 @@ def _both_ways(
 
 
 def beginning_of(link: LinkOfLoop, seconds: float) -> LinkOfLoop:
-    """The packets of the first so many seconds."""
-    end = int(np.searchsorted(link.time, seconds))
+    """The packets of the first so many seconds, and the next one, so that the last of them holds until then."""
+    end = int(np.searchsorted(link.time, seconds)) + 1
 
     def upto(values: Any) -> Any:
         return values if values is None else values[:end]

@@ -101,7 +101,7 @@ def _measurement(source: str, values: dict[str, NDArray[Any]], rows: TableRows, 
         values = {role: reordered_by(column, order) for role, column in values.items()}
         sent = reordered_by(sent, order)
     up, down, whole = _outcomes(values, sent)
-    notes += _spread(sent)
+    notes += _spread(sent, options)
     notes += _missing(values.get("seq"))
     if up is not None and down is None and whole is None:
         notes.append("one direction was measured, and is taken for the uplink")
@@ -133,8 +133,11 @@ def _times(values: dict[str, NDArray[Any]], options: Options) -> tuple[Floats, s
 
 
 def _undated(options: Options) -> str:
-    said = "as --interval says" if options.interval else "is assumed; say otherwise with --interval"
-    return f"the table has no times: {options.interval or 1.0:g} s between packets {said}"
+    return f"the table has no times: {options.interval or 1.0:g} s between packets {_said_of(options)}"
+
+
+def _said_of(options: Options) -> str:
+    return "as --interval says" if options.interval else "is assumed; say otherwise with --interval"
 
 
 def _missing(seq: Floats | None) -> list[str]:
@@ -252,7 +255,7 @@ def _numbered(source: str, found: PacketGrid, delays: Sequence[str], rows: Table
         notes.append(_undated(options))
     grid = found.whole(options.interval or 1.0)
     if found.dated >= 2:
-        notes += _spread(grid.sent)
+        notes += _spread(grid.sent, options)
     delay = dict(zip(delays, grid.delays, strict=True))
     outcomes = PacketOutcomes(grid.outcome, delay.get("delay", delay.get("rtt")))
     is_round_trip = "rtt" in delay and "delay" not in delay
@@ -263,10 +266,14 @@ def _numbered(source: str, found: PacketGrid, delays: Sequence[str], rows: Table
     )  # fmt: skip
 
 
-def _spread(sent: Floats) -> list[str]:
+def _spread(sent: Floats, options: Options) -> list[str]:
     """Spread packets over stamps that are coarser than packets are apart, in place, and say so."""
     count = len(sent)
-    if count < 3 or median_step(sent) > 0.0 or not sent[-1] > sent[0]:
+    if count > 1 and not sent[-1] > sent[0]:
+        for part in parts(count, sent):
+            sent[part] = np.arange(part.start, part.stop) * (options.interval or 1.0)
+        return [f"all rows have the same time: {options.interval or 1.0:g} s between packets {_said_of(options)}"]
+    if count < 3 or median_step(sent) > 0.0:
         return []
     return [
         f"{spread_equal(sent)} of {count} packets have the time of the one before, and are spread evenly up to the "

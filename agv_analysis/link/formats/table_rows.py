@@ -41,6 +41,8 @@ class TableRows:
         self.malformed = Malformed()
         self.has_commas = False
         """Was a comma where it may be a decimal mark?"""
+        self.impossible = 0
+        """Cells with a time that no packet takes."""
         self._dated: dict[str, bool] = {}
         self._units: dict[str, float] = {}
         if not is_enough(self.roles):
@@ -94,6 +96,11 @@ class TableRows:
         read = flags_at if column.role in FLAGS else floats_at
         values, good = read(text, begins, ends, self.header.may_have_commas)
         values *= self._unit(column, values)
+        if column.role in INSTANTS:
+            return values, good & ~np.isinf(values)
+        is_none = np.isinf(values) | ((values < 0.0) & (column.role == "rtt"))
+        self.impossible += int(np.count_nonzero(is_none))
+        values[is_none] = np.nan
         return values, good
 
     def _unit(self, column: TableColumn, values: Floats) -> float:
@@ -120,6 +127,8 @@ class TableRows:
     def notes(self) -> list[str]:
         """What was assumed of how cells are written."""
         said = ["commas are taken for decimal marks"] if self.has_commas else []
+        if self.impossible:
+            said.append(f"{self.impossible} round trips below 0, or infinite times, count as none")
         for role, unit in self._units.items():
             if unit != 1.0:
                 said.append(

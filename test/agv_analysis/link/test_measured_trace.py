@@ -115,7 +115,7 @@ def test_no_more_of_a_long_link_is_kept_than_is_judged(tmp_path: Path, monkeypat
     link = link_of_loop(of_round_trips(losses.tolist(), 0.0))
     found = through_trace(scenario, link, tmp_path / "link.csv")
     assert found.judged == found.to_json()["judged_s"] == 400 * scenario.plant.ts
-    assert len(read_trace(str(tmp_path / "link.csv"), "uplink").lost) == 100  # 2 s of one packet every 20 ms
+    assert len(read_trace(str(tmp_path / "link.csv"), "uplink").lost) == 101  # 2 s of one packet every 20 ms
     assert found.longest_slots == 4
 
 

@@ -349,6 +349,17 @@ def test_stamps_that_are_coarser_than_packets_are_apart(tmp_path: Path) -> None:
     assert "90 of 100 packets have the time of the one before" in said(found)
 
 
+def test_times_that_are_none_are_said_to_be(tmp_path: Path) -> None:
+    found = read(tmp_path / "a", "time,rtt_ms\n0,5\n0.02,-1\n0.04,inf\ninf,5\n0.06,7\n")
+    assert (found.packets, lost(found), found.malformed.shown) == (4, [1, 2], ["line 5: 'inf,5'"])
+    assert "2 round trips below 0, or infinite times, count as none" in said(found)
+    delay = read(tmp_path / "b", "time,delay\n0,-0.001\n1,0.004\n")  # clocks may differ
+    assert (lost(delay), delays(delay)) == ([], [-0.001, 0.004])
+    same = read(tmp_path / "c", "time,lost\n" + "7,0\n" * 5, Options(interval=0.02))
+    assert same.interval == pytest.approx(0.02)
+    assert "all rows have the same time: 0.02 s between packets as --interval says" in said(same)
+
+
 def test_separators_between_quotation_marks_separate_nothing(tmp_path: Path) -> None:
     text = 'time,"note, if any",lost\n0,"a, b",0\n0.02,"say ""x, y""",1\n0.04,,0\n0.06,"a,0\n'
     found = read(tmp_path / "a", text)
