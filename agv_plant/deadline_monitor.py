@@ -8,6 +8,9 @@ import numpy as np
 
 _WINDOW = 20_000
 
+_DURATIONS = ("jitter p50", "jitter p99", "jitter max")
+"""What of a summary is in seconds."""
+
 
 class DeadlineMonitor:
     """Statistics of ticks that are due every `period_ns`, up to number `last`.
@@ -47,8 +50,10 @@ class DeadlineMonitor:
         jitter = self._jitter_ns[: min(self._count, _WINDOW)] * 1e-9
         p50, p99, largest = np.percentile(jitter, [50.0, 99.0, 100.0]) if len(jitter) else (0.0, 0.0, 0.0)
         return {
-            "jitter p50": float(p50),
-            "jitter p99": float(p99),
-            "jitter max": float(largest),
+            **dict(zip(_DURATIONS, (float(p50), float(p99), float(largest)), strict=True)),
             "missed deadlines": float(self.missed),
         }
+
+    def facts(self) -> dict[str, str]:
+        """The same as diagnostics have it, with the unit in the name."""
+        return {f"{name} [s]" if name in _DURATIONS else name: f"{value:.6g}" for name, value in self.summary().items()}

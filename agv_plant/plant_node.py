@@ -309,8 +309,7 @@ class PlantNode(LoopNode[PlantParameters]):
         """Progress; in realtime also deadlines and what became of commands."""
         facts = {"step": str(self.k)}
         if not self._lockstep:
-            summary = self.deadline_monitor.summary().items()
-            facts |= {f"{name} [s]" if name.startswith("jitter") else name: f"{value:.6g}" for name, value in summary}
+            facts |= self.deadline_monitor.facts()
             facts |= {"stops without command": str(self._held.stops), "outdated commands": str(self._held.outdated)}
         return facts
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import multiprocessing
 import os
 import signal
+import socket
 import tempfile
 import time
 from collections import Counter
@@ -35,7 +37,7 @@ _ATTACKS, _ATTACKED_RUNS = 250, 4
 
 _BAGS, _BAGS_AT_A_TIME = 50_000, 100
 
-_FIRST_DOMAIN = 93
+_DOMAINS, _FIRST_PORT = range(101, 0, -1), 41000
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -79,23 +81,28 @@ def _line(name: str, part: dict[str, Any]) -> str:
 # -- workers -----------------------------------------------------------------------------------------------------------
 
 
-def _start_worker(domains: multiprocessing.Queue[int]) -> None:
+_claims: list[socket.socket] = []
+"""In a worker bound to a port that stands for its DDS domain, as in the tests: two loops in one domain would be one."""
+
+
+def _start_worker() -> None:
     """First thing in a worker: a DDS domain of its own; Ctrl-C is the first process' to handle."""
     end_with_parent()
-    os.environ["ROS_DOMAIN_ID"] = str(domains.get())
+    _claims.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    for domain in _DOMAINS:
+        with contextlib.suppress(OSError):
+            _claims[-1].bind(("127.0.0.1", _FIRST_PORT + domain))
+            os.environ["ROS_DOMAIN_ID"] = str(domain)
+            break
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _side_by_side(jobs: int, end: float, work: Callable[[T], R], tasks: Iterable[T]) -> Iterator[tuple[T, R]]:
     """Do tasks in worker processes, in order, beginning none after `end`; each result as soon as it is there."""
     context = multiprocessing.get_context("fork")  # what is imported here is imported there
-    domains: multiprocessing.Queue[int] = context.Queue()
-    first = int(os.environ.get("ROS_DOMAIN_ID", _FIRST_DOMAIN))
-    for number in range(jobs):
-        domains.put(first + number)
     waiting = iter(tasks)
     running: dict[Future[R], T] = {}
-    with ProcessPoolExecutor(jobs, context, _start_worker, (domains,)) as pool:
+    with ProcessPoolExecutor(jobs, context, _start_worker) as pool:
         while True:
             free = jobs - len(running) if time.monotonic() < end else 0
             for task in itertools.islice(waiting, free):

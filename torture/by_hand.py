@@ -14,16 +14,15 @@ from agv_plant.progress_line import progress_line
 from torture.forked import Forked
 from torture.kills import (
     HALT,
-    IN_TIME,
     LAG,
     NODES,
-    SHARE,
     STEPS,
     TS,
     Case,
+    has_come,
     lost_steps,
     outage_settings,
-    recorded_bytes,
+    too_late,
     until,
 )
 from torture.starvation import Starvation
@@ -79,12 +78,12 @@ def _arguments(node: str, case: Case, folder: Path, params: str) -> Iterator[str
 
 def _hurt(case: Case, folder: Path, begun: dict[str, Forked]) -> EndedByHand:
     plant, victim = begun["plant"], begun[case.node]
-    share, pids = SHARE[case.moment], [process.pid for process in begun.values()]
+    is_start, pids = case.moment == "start", [process.pid for process in begun.values()]
     before = Starvation(pids)
-    if share is None:
+    if is_start:
         until(victim, lambda: "[INFO]" in victim.said())
     else:
-        until(plant, lambda: recorded_bytes(folder / "bag") > share * STEPS[case.clock], watched=before)
+        until(plant, lambda: has_come(case, folder / "bag"), watched=before)
     lag = before.in_the_last(LAG)
     sent, starvation = time.monotonic(), Starvation(pids)
     victim.send_signal(case.number)
@@ -95,7 +94,7 @@ def _hurt(case: Case, folder: Path, begun: dict[str, Forked]) -> EndedByHand:
     if case.number != signal.SIGSTOP:
         until(None, lambda: victim.poll() is not None, watched=starvation)
         victim_seconds = time.monotonic() - sent
-    if share is not None or case.number == signal.SIGSTOP:
+    if not is_start or case.number == signal.SIGSTOP:
         until(plant, lambda: False)
     # From the start on a loop that lacks a node waits for it for minutes, as it should.
     time.sleep(_OUTLIVES)
@@ -121,8 +120,7 @@ def faults_by_hand(case: Case, ended: EndedByHand, bag: Path) -> list[str]:
     found = [f"{node} does not end" for node in ended.orphans]
     found += [f"{node} ended by itself" for node in ended.early]
     for whose, seconds in ((f"the {case.node}", ended.victim_seconds), ("the others", ended.seconds)):
-        if seconds - ended.starved > IN_TIME:
-            found.append(f"{whose} ended after {seconds:.1f} s, {ended.starved:.1f} s of it without a processor")
+        found += too_late(f"{whose} ended", seconds, ended.starved, ended.lag)
     found += [f"{node} said a traceback" for node, said in ended.said.items() if "Traceback" in said]
     found += [wrong for node, status in ended.statuses.items() if (wrong := _wrong_status(case, node, status, ended))]
     return found + lost_steps(case, "\n".join(ended.said.values()), bag, ended.lag)
