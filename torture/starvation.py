@@ -35,8 +35,8 @@ class Starvation:
         if now - self._at < _PERIOD:
             return
         waited = self._read()
-        # A thread that is new has waited since its beginning, which may be before the last look; it counts from now on.
-        longest = max((ns - self._waited.get(thread, ns) for thread, ns in waited.items()), default=0)
+        # All that a thread has waited which was not there at the last look, it has waited since.
+        longest = max((ns - self._waited.get(thread, 0) for thread, ns in waited.items()), default=0)
         spent = min(longest / 1e9, now - self._at)
         self.seconds += spent
         self._spans.append((now, spent))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from agv_analysis.runtime.processes import _clean_up, _Process
 from agv_analysis.runtime.shared_memory import SHARED_MEMORY, Leftover, leftovers, remove
 
 USER = """
@@ -58,7 +61,7 @@ def test_what_a_living_process_maps_or_locks_is_no_leftover_and_of_a_dead_one_it
     process = started(USER, str(tmp_path))
     try:
         assert leftovers(tmp_path, 0.0) == [Leftover(tmp_path / "fastrtps_data", 8, True)]
-        assert leftovers(tmp_path) == []  # too young to be sure
+        assert leftovers(tmp_path, 3600.0) == []  # too young to be sure
     finally:
         killed(process)
     found = leftovers(tmp_path, 0.0)
@@ -101,3 +104,17 @@ def test_a_killed_node_leaves_segments_behind_that_are_found() -> None:
         removed = remove(found, 0.0)
     assert segments <= {one.path for one in removed}
     assert not any(path.exists() for path in segments)
+
+
+def test_a_port_that_was_made_a_moment_ago_goes_with_the_run_whose_node_was_killed() -> None:
+    """Who still sent to that node made it anew."""
+    node = _Process("node", [sys.executable, "-c", "import time; time.sleep(60)"])
+    port = SHARED_MEMORY / f"fastrtps_port_of_test_{os.getpid()}"
+    node.send_signal(signal.SIGKILL)
+    try:
+        node.collect()
+        port.write_bytes(b"ring")
+        _clean_up([node])
+        assert not port.exists()
+    finally:
+        port.unlink(missing_ok=True)
