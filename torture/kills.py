@@ -54,6 +54,9 @@ _BYTES_A_STEP = {"lockstep": 290, "realtime": 170}
 _SHARE = {"running": 0.3, "outage": 0.45, "end": 0.75}
 """Share of the run after which a moment has come; at the start as soon as the node is there."""
 
+_SETTLED = 0.5
+"""A file in shared memory that is younger than this [s] may be about to be used."""
+
 PATIENCE = 90.0
 """How long [s] anything may take before it counts as hanging."""
 
@@ -162,12 +165,20 @@ def _ended(runner: Forked, family: dict[str, int], held: list[Path], lag: float)
     until(runner, lambda: False, watched=starvation)
     until(None, lambda: not any(map(_runs, family.values())), watched=starvation)
     seconds = time.monotonic() - begun
-    left = {one.path for one in leftovers(settled=0.0)}.intersection(held) if held else set()
+    left = _unused(held)
+    if left:  # a port has a number, which a program that begins on this machine may have taken meanwhile
+        time.sleep(2 * _SETTLED)
+        left &= _unused(held, _SETTLED)
     orphans = tuple(n for n, pid in family.items() if _runs(pid))
     status = runner.poll()
     said = runner.said() + ("" if status is not None else "it does not end")
     starved = starvation.seconds
     return Ended(99 if status is None else status, said, seconds, starved, lag, orphans, tuple(sorted(left)))
+
+
+def _unused(held: list[Path], settled: float = 0.0) -> set[Path]:
+    """Which of the files in shared memory no process uses."""
+    return {one.path for one in leftovers(settled=settled)}.intersection(held) if held else set()
 
 
 def too_late(who: str, seconds: float, starved: float, lag: float) -> list[str]:
