@@ -135,7 +135,7 @@ def _kills(seed: int, end: float, folder: Path, jobs: int) -> dict[str, Any]:
         done += 1
         if case.number != signal.SIGSTOP:
             longest = max(longest, seen.seconds - seen.starved)
-            if seen.seconds > IN_TIME:
+            if seen.seconds > IN_TIME and not seen.wrong:
                 late[str(case)] = f"{seen.seconds:.1f} s, {seen.starved:.1f} s of it without a processor"
         if seen.wrong:
             bad[str(case)] = [*seen.wrong, seen.said.strip().rpartition("\n")[2]]

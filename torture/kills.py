@@ -51,8 +51,8 @@ TS = 0.005
 _BYTES_A_STEP = {"lockstep": 290, "realtime": 170}
 """What a step adds to the recording, about; in lockstep some 500 are written at a time."""
 
-_SHARE = {"running": 0.3, "outage": 0.45, "end": 0.75}
-"""Share of the run after which a moment has come; at the start as soon as the node is there."""
+_SHARE = {"running": 0.3, "outage": 0.25, "end": 0.75}
+"""Share of the run after which a moment has come; at the start as soon as the node is there. An outage adds less."""
 
 _SETTLED = 0.5
 """A file in shared memory that is younger than this [s] may be about to be used."""
