@@ -61,7 +61,13 @@ def figures(runs: Runs) -> Iterator[Figure]:
     yield Figure("track", "x [m]", "y [m]", curve, is_map=True, where="Fig. 2a: AGV reference track")
     time = runs.run(*gain(GAINS[0])).time
     curve = {"v_r": (time, reference[:, 3])}
-    yield Figure("reference_speed", "time [s]", "v_r [m/s]", curve, where="Fig. 2b: reference translational velocity")
+    yield Figure(
+        "reference_speed",
+        "time [s]",
+        "reference velocity v_r [m/s]",
+        curve,
+        where="Fig. 2b: reference translational velocity",
+    )
     for name, v_max, letters in (("unlimited", math.inf, "abc"), ("limited", LIMIT, "def")):
         tracks_of, error_of, speed_of = (f"Fig. 3{letter}: " for letter in letters)
         by_gain = {f"K_x = {kx:g} 1/s": runs.run(*gain(kx, v_max)) for kx in GAINS}
@@ -69,11 +75,18 @@ def figures(runs: Runs) -> Iterator[Figure]:
         yield Figure(f"{name}_tracks", "x [m]", "y [m]", tracks, is_map=True, where=f"{tracks_of}tracks, {name} speed")
         errors = _begin(by_gain, _y_error)
         of_error = f"{error_of}error in y, {name} speed"
-        yield Figure(f"{name}_y_error", "step k", "y_r - y_c [m]", errors, where=of_error)
+        yield Figure(f"{name}_y_error", "time step k", "error in y, y_r - y_c [m]", errors, where=of_error)
         speeds = _begin(by_gain, lambda run: run.command[:, 0])
         linear_to = 10.0 if math.isinf(v_max) else math.inf
         of_speed = f"{speed_of}translational velocity, {name}"
-        yield Figure(f"{name}_speed", "step k", "v [m/s]", speeds, linear_to=linear_to, where=of_speed)
+        yield Figure(
+            f"{name}_speed",
+            "time step k",
+            "translational velocity v [m/s]",
+            speeds,
+            linear_to=linear_to,
+            where=of_speed,
+        )
 
 
 def _y_error(run: Run) -> Floats:
@@ -100,7 +113,7 @@ def write(figure: Figure, folder: Path) -> None:
         if math.isfinite(figure.linear_to):
             axes.set_yscale("symlog", linthresh=figure.linear_to)
         if len(figure.curves) > 1:
-            axes.legend()
+            axes.legend(handlelength=1.2)
         try:
             save_figure(canvas, folder / f"{figure.file_name}.svg", figure.where)
             save_figure(canvas, folder / f"{figure.file_name}.png", figure.where, dpi=300)
