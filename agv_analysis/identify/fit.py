@@ -37,6 +37,9 @@ _STARTS = 4
 _STEP = 0.025
 """Distance of dead times [s] in the first search."""
 
+_CENTRINGS = 40
+"""How often, at most, a grid of dead times is moved to where the best ones are; recordings with noise need a few."""
+
 _REACH, _LEAST_REACH, _ROUNDS = 3.0, 2e-3, 10
 """Lags about the best that come first, in standard deviations and at least so many [s]; how often more are tried."""
 
@@ -216,7 +219,7 @@ class _Problem(NamedTuple):
         """
         lags = np.linspace(low, high, _ROWS)
         centres, across = best.dead_time + best.lag - lags, max(0.5 * (high - low), room)
-        while True:
+        for _ in range(_CENTRINGS):  # without noise the best places jump about by rounding, without end
             grid = self.fits(noise, lags, centres[:, np.newaxis] + np.linspace(-across, across, _COLUMNS))
             columns = np.argmin(grid.squares, axis=1)
             if across <= room and (np.abs(columns - _COLUMNS // 2) <= _COLUMNS // 4).all():
@@ -224,8 +227,9 @@ class _Problem(NamedTuple):
             at_edge = bool(((columns == 0) | (columns == _COLUMNS - 1)).any())
             centres = grid.dead_times[np.arange(_ROWS), columns]
             if across > LONGEST_DEAD_TIME:
-                return grid
+                break
             across = 1.5 * across if at_edge else max(room, across / 5.0)
+        return grid
 
     def best_of(self, noise: IncrementNoise, grid: _Grid, shortest: float) -> _Point:
         """The best fit that is reached from the best dead time of any of the lags that fit well."""
