@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from agv_analysis.identify.bearable_gains import bearable_gains
 from agv_analysis.identify.first_order import HeldCommand
-from agv_analysis.identify.fit import FirstOrderFit, Interval
+from agv_analysis.identify.fit import FirstOrderFit, Increments, Interval, fit_first_order
 from agv_analysis.identify.increment_noise import IncrementNoise
 from agv_analysis.identify.robot import SPEEDS, IdentifiedRobot, IdentifiedSpeed, identify
 from agv_analysis.recordings.posture_track import Track
@@ -120,6 +120,15 @@ def test_commands_of_another_robot_have_no_number() -> None:
     found = identified(robot._replace(commands=other.commands[: len(robot.sent)]))
     assert found["v"].fit is None
     assert found["w"].fit is None
+
+
+def test_a_robot_without_noise_or_delay_is_found_in_few_rounds() -> None:
+    """Where rounding alone is left the likelihood has no one best place to move a grid to."""
+    t = np.arange(0.0, 20.0, 0.02)
+    v = np.repeat(np.random.default_rng(1).uniform(0.0, 1.0, 50), 20)
+    found = fit_first_order(HeldCommand(t, v), Increments(t, 0.02 * v[:-1]), 0.0, False)
+    assert found is not None
+    assert [one.value for one in (found.dead_time, found.lag, found.gain)] == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
 
 
 def test_a_recording_too_short_is_refused() -> None:
