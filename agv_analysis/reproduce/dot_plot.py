@@ -41,8 +41,6 @@ def write(table: Table, folder: Path) -> None:
 
 def _draw(axes: Any, table: Table) -> None:
     """`axes` is a matplotlib Axes. What did not happen has no dot, what diverges an open one at the right edge."""
-    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
-
     shown: list[float] = []
     for marker, column in zip(_MARKERS, table.drawn, strict=False):
         values = [(value, i) for i, row in enumerate(table.rows) if (value := _number(row[column])) is not None]
@@ -50,7 +48,7 @@ def _draw(axes: Any, table: Table) -> None:
         (dots,) = axes.plot([x for x, _ in values], [i for _, i in values], marker, label=column, ms=4.0, alpha=0.8)
         beyond = [i for i, row in enumerate(table.rows) if text_of(row[column]) == "diverges"]
         if beyond:
-            axes.set_xlabel("open, at the right edge: diverges")
+            axes.set_xlabel("open, at the right edge: diverges", loc="right")
             at_edge = {
                 "transform": axes.get_yaxis_transform(),
                 "clip_on": False,
@@ -60,18 +58,33 @@ def _draw(axes: Any, table: Table) -> None:
             axes.plot([1.0] * len(beyond), beyond, marker, ms=4.0, **at_edge)
     names = list(table.rows[0])[: table.named]
     axes.set_yticks(range(len(table.rows)), [", ".join(text_of(row[name]) for name in names) for row in table.rows])
-    axes.set_ylabel(", ".join(names))
+    axes.set_ylabel(", ".join(names), labelpad=6.0)
     axes.invert_yaxis()
     axes.grid(axis="y", lw=0.3)
+    _scale(axes, shown)
+    if axes.get_xlabel() and axes.get_xscale() != "linear":  # room between the largest value and the edge
+        axes.set_xlim(right=10.0 * axes.get_xlim()[1])
+
+
+def _scale(axes: Any, shown: list[float]) -> None:
+    """A logarithmic axis, with few ticks, where the values differ much in size; about 0 it is linear."""
+    from matplotlib.ticker import LogLocator, NullLocator, SymmetricalLogLocator
+
     sizes = [abs(value) for value in shown if value != 0.0]
-    if sizes and max(sizes) > _WIDE * min(sizes):
+    if not sizes or max(sizes) <= _WIDE * min(sizes):
+        return
+    if min(shown) > 0.0:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(numticks=5))
+    else:
         smallest = max(min(sizes), 1e-4 * min(max(sizes), 1.0))
         axes.set_xscale("symlog", linthresh=smallest)
         locator = SymmetricalLogLocator(base=10.0, linthresh=smallest)
         locator.set_params(numticks=4)
         axes.xaxis.set_major_locator(locator)
-        axes.xaxis.set_minor_locator(NullLocator())
         axes.set_xlim(left=0.0 if min(shown) >= 0.0 else None)
+        axes.set_xticks([tick for tick in axes.get_xticks() if tick == 0.0 or abs(tick) > 10.0 * smallest])
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _number(value: object) -> float | None:

@@ -55,7 +55,7 @@ def test_the_cursor_goes_through_the_panel_of_the_corridor_as_well(
     show(chromium, path)
     waiting = WebDriverWait(chromium, 60.0)
     point_at(chromium, "time", 5.0)
-    waiting.until(lambda c: of_plot(c, "corridor", "plot._hoverdata") is not None)
+    waiting.until(lambda c: of_plot(c, "corridor", "Boolean(plot._hoverdata)"))
     at = of_plot(chromium, "time", "plot._hoverdata[0].x")
     assert of_plot(chromium, "corridor", "plot._hoverdata[0].x") == pytest.approx(at - 4.0, abs=0.02)
     point_at(chromium, "corridor", 3.0)
