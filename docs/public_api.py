@@ -10,8 +10,11 @@ import importlib
 import inspect
 import json
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -101,24 +104,40 @@ def _commands(group: click.Group | None = None, above: str = "agv-ncs") -> Itera
             yield from _commands(command, f"{above} {name}")
 
 
-def _json() -> Iterator[tuple[str, str]]:
-    import agv_ncs
+DOCUMENTS = {
+    "stability": "stability {outages} --set plant.duration=5.0 --set error_detector.lap_time=5.0 --corridor 0.25",
+    "analyse": "analyse {bag}",
+    "require": "require {paper} --set error_detector.lap_time=5.0",
+    "channel": "channel {outages}",
+    "link": "link {bag}",
+    "bag info": "bag info {bag}",
+    "bag outages": "bag outages {bag} --topic /edge/pose",
+    "replay --compare": "replay {bag} --compare",
+}
+"""Commands whose `--json` is promised, with short work; `simulate` writes what `analyse` does."""
+
+
+def _json(documents: Mapping[str, str] = DOCUMENTS) -> Iterator[tuple[str, str]]:
+    from agv_analysis.cli import main
     from agv_analysis.doctor.examination import examine
 
-    scenario = agv_ncs.load_scenario(REPOSITORY / "config/outages.yaml", ["plant.duration=5.0"])
-    documents = {
-        "analyse": agv_ncs.analyse(agv_ncs.simulate(scenario)).to_json(),
-        "stability": agv_ncs.margins(scenario).to_json(),
-    }
-    for name, document in documents.items():
+    where = {"outages": "config/outages.yaml", "paper": "config/paper.yaml", "bag": "bags/sample"}
+    for name, words in documents.items():
+        with tempfile.TemporaryDirectory() as folder, redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+            file = Path(folder) / "document.json"
+            command = words.format(**{key: REPOSITORY / path for key, path in where.items()}).split()
+            main([*command, "--json", str(file)], standalone_mode=False)
+            document = json.loads(file.read_text(encoding="utf-8"))
         yield from ((f"{name}: {key}", "key") for key in sorted(set(_keys(document))))
     yield from ((f"doctor: {key}", "key") for key in examine(0.0).to_json())
 
 
 def _keys(of: Any, above: str = "") -> Iterator[str]:
-    """Keys of a document, those inside of others after a dot; a list is its first item."""
+    """Keys of a document, those inside of others after a dot; a list is its first item. Numbers are no names."""
     if isinstance(of, dict):
         for key, value in of.items():
+            if key.isdecimal():
+                continue
             yield f"{above}{key}"
             yield from _keys(value, f"{above}{key}.")
     elif isinstance(of, list) and of:

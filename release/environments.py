@@ -20,6 +20,19 @@ TESTS = (
 )
 """Bags are read, the loop is simulated, messages are encoded; without ROS, and in a minute."""
 
+TRIED = (
+    ("simulate", "config/outages.yaml", "--set", "plant.duration=5.0", "--report", "{}/run.html",
+     "--figures", "{}/run"),
+    ("sweep", "config/paper.yaml", "--vary", "controller.kx=5:60:2", "--set", "plant.duration=5.0", "--out",
+     "{}/sweep.parquet", "--format", "parquet", "--report", "{}/sweep.html"),
+    ("bag", "export", "bags/sample", "--parquet", "--out", "{}/bag"),
+    ("doctor", "--seconds", "0.2"),
+)  # fmt: skip
+"""Commands that use what extras bring: pictures, pages, Parquet."""
+
+MADE = ("import agv_analysis.explore.app", "import distributed, dpkt, msgspec, lz4.frame, isal")
+"""What has to be importable beside them: the explorer needs a person at a browser."""
+
 TOOLS = ("pytest", "hypothesis", "mcap-ros2-support", "scipy", "ruff")
 
 UV = (sys.executable, "-m", "uv", "pip")
@@ -43,7 +56,16 @@ def passes(python: str, resolution: str) -> bool:
         )  # for its metadata; the tests take the sources
         tests = [str(own), "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "hypothesis.extra.pytestplugin"]
         environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-        return subprocess.run([*tests, *TESTS], cwd=REPOSITORY, env=environment, check=False).returncode == 0
+        commands = [
+            [str(own), "-m", "agv_analysis.cli", *(word.replace("{}", folder) for word in words)] for words in TRIED
+        ]
+        commands += [[str(own), "-c", code] for code in MADE]
+        done = [subprocess.run([*tests, *TESTS], cwd=REPOSITORY, env=environment, check=False)]
+        done += [subprocess.run(one, cwd=REPOSITORY, stdout=subprocess.DEVNULL, check=False) for one in commands]
+        for one in done:
+            if one.returncode:
+                sys.stdout.write(f"failed: {' '.join(one.args)}\n")
+        return not any(one.returncode for one in done)
 
 
 def has(python: str) -> bool:
