@@ -7,6 +7,8 @@ that `--help` and errors come at once and analysis works where there is no ROS.
 from __future__ import annotations
 
 import importlib
+import logging
+import sys
 from typing import Any
 
 import click
@@ -33,6 +35,7 @@ class _Group(click.Group):
         from agv_ros.errors import UserError
         from agv_ros.printable import printable
 
+        _announce_compilation()
         try:
             return super().invoke(ctx)
         except OSError as error:  # of a path that no one has thought of, as one that is too long
@@ -49,6 +52,23 @@ class _Group(click.Group):
             raise click.ClickException(said) from None
         except UserError as error:
             raise click.ClickException(printable(str(error))) from None
+
+
+class _OnceToTerminal(logging.Handler):
+    """Says at a terminal, the first time that something is compiled, why a command takes so long."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        log = logging.getLogger(record.name)
+        log.removeHandler(self)
+        if sys.stderr.isatty():
+            click.echo("note: compiles the loop, once for this version: some seconds", err=True)
+
+
+def _announce_compilation() -> None:
+    log = logging.getLogger("agv_analysis.compiled")
+    log.setLevel(logging.INFO)
+    log.propagate = False
+    log.handlers[:] = [_OnceToTerminal()]
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})

@@ -15,6 +15,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
+import logging
 import os
 import threading
 from collections.abc import Callable
@@ -29,6 +30,9 @@ HAS_NUMBA = importlib.util.find_spec("numba") is not None
 """Is numba installed? Without it, everything runs as plain Python."""
 
 _LOCATOR = "agv_analysis.compiled_cache.ContentLocator"
+
+LOG = logging.getLogger(__name__)
+"""Says which function is about to be compiled, because it is not on disk."""
 
 _COMPILING = threading.Lock()
 """Held where numba's settings are changed for a moment."""
@@ -48,8 +52,11 @@ def _compiled(function: Function, replacements: tuple[tuple[Function, Function],
     called = dict(replacements)
     if not HAS_NUMBA:
         return replaced(function, called)
+    folder = _cache_folder(function, called)
+    if folder is not None and not any(folder.glob("*.nbi")):  # numba's index of what is there
+        LOG.info("%s is compiled, and kept in %s", function.__qualname__, folder)
     with _COMPILING:
-        return _compile(function, _cache_folder(function, called), called)
+        return _compile(function, folder, called)
 
 
 def numbers(array: Any) -> Any:

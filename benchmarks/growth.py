@@ -74,7 +74,7 @@ def _vehicles(vehicles: int, _: Path) -> Work:
 
 def _states(states: int, _: Path) -> Work:
     """Mean-square test of a loop in which a state is held while outcomes are lost; states grow as its delay does."""
-    from agv_analysis.stability.markov_channel import gilbert_elliott
+    from agv_analysis.link.markov_channel import gilbert_elliott
     from agv_analysis.stability.mean_square import spectral_radius
 
     generator = np.random.default_rng(1)
@@ -91,7 +91,7 @@ def _messages(messages: int, folder: Path) -> Work:
 
 
 SUBJECTS = {
-    "steps": Subject("one simulated run, by its steps", (10**4, 10**5, 10**6, 10**7), _steps),
+    "steps": Subject("one simulated run, by its steps", (10**3, 10**4, 10**5, 10**6), _steps),
     "seeds": Subject("a sweep of runs of 2000 steps, by its seeds", (10, 100, 1000, 10_000), _seeds),
     "vehicles": Subject("20 000 steps of a loop on a shared uplink, by its vehicles", (1, 10, 100, 1000), _vehicles),
     "states": Subject("mean-square test under losses in bursts, by the loop's states", (2, 4, 8, 16), _states),
@@ -132,7 +132,8 @@ def row(name: str) -> str:
         environment = {**os.environ, "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         said = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True).stdout
         costs.append(Cost(*json.loads(said)))
-    cells = [f"{size:,}: {_time(cost.seconds)}, {cost.memory / 1e6:.3g} MB" for size, cost in zip(subject.sizes, costs)]
+    pairs = zip(subject.sizes, costs, strict=True)
+    cells = [f"{size:,}: {_time(cost.seconds)}, {cost.memory / 1e6:.3g} MB" for size, cost in pairs]
     whole = exponent(subject.sizes, [cost.seconds for cost in costs])
     last = exponent(subject.sizes[-2:], [cost.seconds for cost in costs[-2:]])
     return f"| {subject.what} | {' | '.join(cells)} | {whole:.2f} | {last:.2f} |"

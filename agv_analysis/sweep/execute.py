@@ -67,7 +67,9 @@ def _distributed() -> Any:
     try:
         return importlib.import_module("distributed")
     except ImportError:
-        raise SweepError("--scheduler needs Dask on this machine and on its workers: pip install distributed") from None
+        raise SweepError(
+            "--scheduler needs Dask on this machine and on its workers: pip install 'agv_ncs[cluster]'"
+        ) from None
 
 
 @contextmanager
