@@ -151,7 +151,9 @@ def main(subjects: tuple[str, ...], one: tuple[str, int] | None) -> None:
     if one is not None:
         click.echo(json.dumps(measure(SUBJECTS[one[0]], one[1])))
         return
-    click.echo("| what | | | | | exponent | of the last decade |\n|---|---|---|---|---|---|---|")
+    click.echo(
+        "| what | cost and memory of each size | | | | exponent | between the last two sizes |\n|---|---|---|---|---|---|---|"
+    )
     for name in subjects or SUBJECTS:
         click.echo(row(name))
 
