@@ -12,6 +12,7 @@ import json
 import math
 import platform
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -108,14 +109,17 @@ def all_panels(analysis: Observations, within: CorridorOfRun | None = None) -> l
 
 def template(name: str) -> Any:
     """A template of this folder. Raises UserError if jinja2 is not installed."""
-    jinja2: Any = _needed("jinja2")
+    with _needed():
+        jinja2: Any = importlib.import_module("jinja2")
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     return jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(name)
 
 
-def _needed(module: str) -> Any:
+@contextmanager
+def _needed() -> Iterator[None]:
+    """Around imports of what an extra brings."""
     try:
-        return importlib.import_module(module)
+        yield
     except ImportError as error:
         raise UserError(f"a report needs plotly and jinja2: pip install 'agv_ncs[report]' ({error})") from None
 
@@ -130,7 +134,8 @@ def fill(
     `parameters` the params file of the scenario; scripts find what is in `more` beside the figures.
     """
     page = template(name)
-    plotly: Any = _needed("plotly.offline")
+    with _needed():
+        plotly: Any = importlib.import_module("plotly.offline")
     # Library and figures are packed, and the data is a script: JSON in which nothing can end it.
     text: str = page.render(
         library=_library(plotly.get_plotlyjs),
