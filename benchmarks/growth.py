@@ -151,9 +151,8 @@ def main(subjects: tuple[str, ...], one: tuple[str, int] | None) -> None:
     if one is not None:
         click.echo(json.dumps(measure(SUBJECTS[one[0]], one[1])))
         return
-    click.echo(
-        "| what | cost and memory of each size | | | | exponent | between the last two sizes |\n|---|---|---|---|---|---|---|"
-    )
+    click.echo("| what | cost and memory of each size | | | | exponent | between the last two sizes |")
+    click.echo("|---|---|---|---|---|---|---|")
     for name in subjects or SUBJECTS:
         click.echo(row(name))
 
