@@ -20,9 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
+from agv_analysis.lane_rows import LANES
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.simulation.batch import cores
+from agv_analysis.simulation.lanes import Group
 from agv_analysis.simulation.loop import RunInputs, at_rest, statistics_of_two
 from agv_analysis.simulation.single import settings_of
 from agv_cloud.reference.reference import Reference
@@ -48,12 +50,14 @@ def measure() -> list[Comparison]:
     reference = Reference(scenarios[0].error_detector).first(STEPS)
     lost = losses(scenarios[-1].relay.uplink, 1, "uplink", STEPS)
     bare = _rate(len(GAINS) * STEPS, lambda: _kernel(scenarios[-len(GAINS) :], reference, lost))
+    side_by_side = _rate(LANES * STEPS, _over_lanes(scenarios[-LANES:], reference, lost))
     plain = _rate(STEPS, lambda: _plain(reference.tolist(), lost.tolist(), 25.0))
     batched = _rate(2_000 * 1_000, lambda: _batched(reference[:1_000], 2_000))
     found = [
         Comparison("simulation, one core", one, "plain Python", plain, UNIT, 20.0),
         Comparison("simulation, one core", one, "numpy, 2000 runs at once", batched, UNIT),
-        Comparison("sweep with its verdicts, one core", one, "its bare loops", bare, UNIT, 0.9),
+        Comparison("sweep with its verdicts, one core", one, "bare loops, two runs at a time", bare, UNIT, 1.5),
+        Comparison("sweep with its verdicts, one core", one, "bare loops, side by side", side_by_side, UNIT),
         Comparison(f"simulation, {cores()} cores", everything, "one core", one, UNIT, 0.9 * cores()),
     ]
     octave = _octave(reference, lost)
@@ -86,6 +90,17 @@ def _kernel(scenarios: list[Scenario], reference: NDArray[np.float64], lost: NDA
     squares = np.zeros((2, len(lost)))
     for one, other in zip(cases[::2], cases[1::2], strict=True):
         laps(reference, one, other, *squares)
+
+
+def _over_lanes(
+    scenarios: list[Scenario], reference: NDArray[np.float64], lost: NDArray[np.bool_]
+) -> Callable[[], None]:
+    """A lap of LANES scenarios side by side, nothing around it."""
+    never, start = np.zeros_like(lost), at_rest(*scenarios[0].plant.initial_pose)
+    group = Group(reference, [RunInputs(lost, never, start, settings_of(scenario)) for scenario in scenarios])
+    begun = group.rows([start] * len(scenarios))
+    group.drive(begun.copy(), 0, STEPS)  # compiles
+    return lambda: group.drive(begun.copy(), 0, STEPS)
 
 
 def _plain(reference: list[list[float]], lost: list[bool], kx: float) -> tuple[float, ...]:

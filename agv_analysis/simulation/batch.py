@@ -8,18 +8,20 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
-from itertools import groupby, zip_longest
+from itertools import chain, groupby, zip_longest
 from typing import get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import numbers
-from agv_analysis.metrics.order_statistics import P99, not_exceeded
+from agv_analysis.compiled import HAS_NUMBA, numbers
+from agv_analysis.lane_rows import LANES
+from agv_analysis.metrics.order_statistics import distances_of
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.decay import Decay, decay, decay_over_links
+from agv_analysis.simulation.lanes import Choices, choices_of, fits_lanes, statistics_over_lanes
 from agv_analysis.simulation.link_loop import LinkTrace, contraction_over_links, empty_trace, statistics_over_links
 from agv_analysis.simulation.loop import (
     Loop,
@@ -113,6 +115,8 @@ class _Batch:
         self._settings = functools.cache(lambda row: settings_of(scenarios[row]))
         self._start = functools.cache(lambda row: start_of(scenarios[row]))
         self._on_reference = functools.cache(self._start_on_reference)
+        self._of_kind = functools.cache(self._make_reference)
+        self._choices = functools.cache(self._choices_of)
         # Runs of one kind share a reference and a compiled loop.
         kinds: dict[tuple[ErrorDetectorParameters, int, str, str], int] = {}
         self._kind = [
@@ -134,10 +138,12 @@ class _Batch:
         for kind, jobs in groupby(sorted(unit, key=lambda job: self._kind[job[0]]), lambda job: self._kind[job[0]]):
             row = self._kind.index(kind)
             parts = replacements_of(self._scenarios[row])
-            of_kind = list(jobs)
+            of_kind, reference = list(jobs), self._reference(row)
             try:
-                for job, (steps, *metrics), of_start, *others in run(
-                    self._reference(row), of_kind, realisations, parts
+                alone: list[Job] = []  # which the lanes leave over
+                for job, (steps, *metrics), of_start, *others in chain(
+                    self._over_lanes(reference, of_kind, realisations, parts, alone),
+                    run(reference, alone, realisations, parts),
                 ):
                     self.table[job] = (steps, *of_start, *metrics, *others)
             except PartError as error:
@@ -154,6 +160,29 @@ class _Batch:
             except PartError as error:
                 return f"{error} of the run with seed {seed}"
         return ""
+
+    def _over_lanes(
+        self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements, alone: list[Job]
+    ) -> Iterator[Result]:
+        """Side by side, as many as can be; all others come into `alone`."""
+        fits = HAS_NUMBA and not parts and fits_lanes(reference)
+        groups: dict[Choices, list[Job]] = {}
+        for job in jobs:
+            choices = self._choices(job[0]) if fits else None
+            (alone if choices is None else groups.setdefault(choices, [])).append(job)
+        for of_group in groups.values():
+            for first in range(0, len(of_group), LANES):
+                group = of_group[first : first + LANES]
+                inputs = [self._inputs(job, realisations) for job in group]
+                on_reference = [self._on_reference(row) for row, _ in group]
+                twins = [start_of(self._scenarios[row], TWIN_OFFSET) for row, _ in group] if self._twins else []
+                for job, found in zip(
+                    group, statistics_over_lanes(reference, inputs, on_reference, twins), strict=True
+                ):
+                    if found is None:
+                        alone.append(job)
+                    else:
+                        yield job, *found
 
     def _by_twos(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
@@ -172,7 +201,7 @@ class _Batch:
                 else run_parts(statistics_of_two, parts, reference, *inputs, *squares)
             )
             for job, metrics, of_start, run, square in zip(pair, found, decays, inputs, squares, strict=True):
-                yield job, metrics, of_start, _p99(square[run.settled : metrics.steps]), math.nan
+                yield job, metrics, of_start, distances_of(square[run.settled : metrics.steps]).p99, math.nan
 
     def _with_twins(
         self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements
@@ -183,7 +212,7 @@ class _Batch:
                 inputs, of_start = self._with_decay(reference, job, realisations, parts)
                 squares = np.zeros(self._steps[job[0]])
                 found, contraction = run_parts(statistics_of_twins, parts, reference, inputs, twin, squares)
-                yield job, found, of_start, _p99(squares[inputs.settled : found.steps]), contraction
+                yield job, found, of_start, distances_of(squares[inputs.settled : found.steps]).p99, contraction
             else:
                 inputs = self._inputs(job, realisations)
                 found, of_start, p99, traces = self._over_links(reference, job, realisations, parts)
@@ -205,6 +234,12 @@ class _Batch:
         first = self._reference(row)[0]
         return start_of(self._scenarios[row], at=Pose(*(float(value) for value in first[:3])))
 
+    def _choices_of(self, row: int) -> Choices | None:
+        """Those of a scenario's runs, None if they cannot be in lanes: only what is lost may be random in a slot."""
+        relay, plant = self._scenarios[row].relay, self._scenarios[row].plant
+        is_direct = relay.uplink.is_direct and relay.downlink.is_direct
+        return choices_of(self._settings(row)) if is_direct and not plant.is_noisy and plant.slip_noise == 0.0 else None
+
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay
         return relay.uplink.is_direct and relay.downlink.is_direct
@@ -220,16 +255,18 @@ class _Batch:
         found = run_parts(statistics_over_links, parts, reference, inputs, *links, up, down, squares)
         held = [numbers(trace.held[: found.steps]) for trace in (up, down)]
         of_start = run_parts(decay_over_links, parts, reference, inputs, self._on_reference(job[0]), *held)
-        settled = squares[max(0, of_start.settle_1cm_steps) : found.steps]
-        with np.errstate(over="ignore"):
-            largest, rms = math.sqrt(settled.max(initial=0.0)), math.sqrt(np.mean(settled)) if len(settled) else 0.0
-        return found._replace(deviation_max=largest, deviation_rms=rms), of_start, _p99(settled), (up, down)
+        largest, rms, p99 = distances_of(squares[max(0, of_start.settle_1cm_steps) : found.steps])
+        return found._replace(deviation_max=largest, deviation_rms=rms), of_start, p99, (up, down)
 
     def _realisation(self, job: Job, realisations: Realisations) -> ChannelRealisation:
         row, column = job
         return realisations(self._seeds[column], self._steps[row], self._scenarios[row].plant.ts)
 
     def _reference(self, row: int) -> Floats:
+        return self._of_kind(self._kind[row])
+
+    def _make_reference(self, kind: int) -> Floats:
+        row = self._kind.index(kind)
         detector = self._scenarios[row].error_detector
         reference: Floats = numbers(reference_of(detector, self._steps[row] + detector.steps_ahead))
         return reference
@@ -244,8 +281,3 @@ class _Batch:
             numbers(realisation.normals(NOISE)) if scenario.plant.is_noisy else None,
             numbers(realisation.normals(SLIP)) if scenario.plant.slip_noise > 0.0 else None,
         )
-
-
-def _p99(squares: Floats) -> float:
-    """`deviation_p99` of squared distances [m^2], shape (n,); inf where one is no number, 0 without any."""
-    return math.sqrt(not_exceeded(squares, P99)) if len(squares) else 0.0

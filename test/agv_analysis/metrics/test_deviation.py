@@ -71,10 +71,10 @@ def test_figures_of_a_lap_by_counting() -> None:
     assert found.worst[0].outage is not None
     assert found.worst[0].outage.slots == 28
     row = simulate_batch([run.scenario], [run.scenario.relay.seed])[0, 0]
-    assert float(row["deviation_max"]) == found.largest
-    assert float(row["deviation_p99"]) == pytest.approx(found.p99, rel=1e-12)
-    assert float(row["deviation_rms"]) == pytest.approx(found.rms, rel=1e-12)
-    assert float(row["speed_max"]) == found.speed
+    assert float(row["deviation_max"]) == pytest.approx(found.largest, rel=1e-9)
+    assert float(row["deviation_p99"]) == pytest.approx(found.p99, rel=1e-9)
+    assert float(row["deviation_rms"]) == pytest.approx(found.rms, rel=1e-9)
+    assert float(row["speed_max"]) == pytest.approx(found.speed, rel=1e-9)
 
 
 def test_a_delayed_run_in_a_batch_has_the_same_figures() -> None:

@@ -294,7 +294,7 @@ def test_many_runs_are_the_single_ones(settings_of: Callable[[], list[str]]) -> 
     table = simulate_batch([scenario], [scenario.relay.seed], twins=True)[0, 0]
     run = simulate(scenario)
     assert table["n_ul_max"] == run.n_ul.max()
-    assert table["final"] == run.reference[-1, 1] - run.pose[-1, 1]
+    assert table["final"] == pytest.approx(run.reference[-1, 1] - run.pose[-1, 1], rel=1e-9, abs=1e-9)
     start = np.array(run.scenario.plant.initial_pose)
     one, twin = (_after(scenario, tuple((start + offset).tolist())) for offset in (0.0, TWIN_OFFSET))
     apart = np.linalg.norm(twin - one) / (math.sqrt(3.0) * TWIN_OFFSET)
