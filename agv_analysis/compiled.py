@@ -91,8 +91,6 @@ def _compiled(function: Function, replacements: tuple[tuple[Function, Function],
     if not HAS_NUMBA:
         return replaced(function, called)
     folder = _cache_folder(function, called)
-    if folder is not None and not any(folder.glob("*.nbi")):  # numba's index of what is there
-        LOG.info("%s is compiled, and kept in %s", function.__qualname__, folder)
     with _COMPILING:
         return _compile(function, folder, called)
 
@@ -121,6 +119,8 @@ def _compile(
     """`function` compiled, to be kept in `folder` if there is one."""
     import numba
 
+    if folder is not None and not any(folder.glob("*.nbi")):  # numba's index of what is there
+        LOG.info("%s is compiled, and kept in %s", function.__qualname__, folder)
     copy = with_globals(function, _compiled_calls(function, replacements, {}, way))
     # Looked at by the decorator, not later. An older numba has no such locators, and compiles for each place anew.
     wanted = {"CACHE_DIR": str(folder or ""), "CACHE_LOCATOR_CLASSES": _LOCATOR}
