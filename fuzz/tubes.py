@@ -20,16 +20,18 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from agv_analysis.compiled import compiled
 from agv_analysis.corridor.lap_loop import LapLoop, Outcomes
 from agv_analysis.corridor.outer_tube import Tube, outer_tube, with_remainder
 from agv_analysis.corridor.widths import Widths
+from agv_analysis.run import Floats
 from agv_analysis.scenario import load_scenario
 from agv_analysis.stability.scenario_loop import loop_on_lap
 
 Lengths = NDArray[np.int64]
 
 CONFIG = str(Path(__file__).parent.parent / "config" / "outages.yaml")
-TRACKS = "line", "circle", "eight", "paper"
+TRACKS = "line", "circle", "eight", "paper", "warehouse"
 POLICIES = {
     "hold": (12, ()), "align": (12, ()), "predict": (30, ("plant.speed_scale=1.1",)),
 }  # fmt: skip
@@ -108,12 +110,33 @@ class Search:
         """Largest share of a bound, largest distance [m], and how many of the runs were outside of the tube."""
         every, tube = self._loop.steps // _PLACES, self.tube
         found, paths = self._loop.excursions(outcomes, every, kept=_SLOTS, follow=False)
-        rows = (found.steps[:_PLACES, None] + np.arange(_SLOTS)) % len(tube.bounds)
-        deviation = paths[:_PLACES] - tube.nominal[rows]
-        reached, bounds = deviation @ tube.template.directions.T, tube.bounds[rows]
-        is_outside = ~(reached <= bounds + _ROUNDING).all(axis=(1, 2))
-        shares = np.where(bounds > max(_SMALL, 1e-3 * bounds.max()), reached / np.maximum(bounds, 1e-300), 0.0)
-        return float(shares.max()), float(np.hypot(paths[..., 0], paths[..., 1]).max()), int(is_outside.sum())
+        small = max(_SMALL, 1e-3 * float(tube.bounds.max()))
+        share, distance, outside = compiled(_held_against)(
+            paths[:_PLACES], found.steps[:_PLACES], tube.bounds, tube.nominal, tube.template.directions, small
+        )
+        return float(share), float(distance), int(outside)
+
+
+def _held_against(
+    paths: Floats, steps: Lengths, bounds: Floats, nominal: Floats, directions: Floats, small: float
+) -> tuple[float, float, int]:
+    """As `_used` says, of paths of errors of shape (S, slots, 3) that begin at these steps of the lap."""
+    nearest, farthest, outside = 0.0, 0.0, 0
+    for s in range(paths.shape[0]):
+        is_outside = False
+        for i in range(paths.shape[1]):
+            row = (steps[s] + i) % bounds.shape[0]
+            x_e, y_e, theta_e = paths[s, i, 0], paths[s, i, 1], paths[s, i, 2]
+            x, y, theta = x_e - nominal[row, 0], y_e - nominal[row, 1], theta_e - nominal[row, 2]
+            farthest = max(farthest, math.hypot(x_e, y_e))
+            for j in range(directions.shape[0]):
+                reached, bound = directions[j, 0] * x + directions[j, 1] * y + directions[j, 2] * theta, bounds[row, j]
+                if not reached <= bound + _ROUNDING:
+                    is_outside = True
+                if bound > small:
+                    nearest = max(nearest, reached / bound)
+        outside += is_outside
+    return nearest, farthest, outside
 
 
 def _outcomes(lengths: Lengths) -> Outcomes:

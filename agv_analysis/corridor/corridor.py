@@ -12,6 +12,7 @@ from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.leaving import Leaving, chain_alone, is_random, leaving
 from agv_analysis.corridor.outage_sequences import WorstSequence, largest_n
 from agv_analysis.corridor.outer_tube import Tube, applies_to, with_remainder
+from agv_analysis.corridor.rms_deviation import RmsDeviation, rms_deviation
 from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, roughly, single_outage
 from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stationary_deviation
 from agv_analysis.corridor.widths import Widths, widths_of
@@ -63,8 +64,8 @@ class Corridor:
     """As `tube`, with what is of second order covered as well; None where none was found that stays inside."""
     tube_reason: str
     stationary: StationaryDeviation | None
-    """Stationary deviation, by its second moments; None: not computed, `stationary_reason` says why."""
-    stationary_reason: str
+    """Stationary deviation of the linear loop, by its second moments; None: not computed, `rms.reason` says why."""
+    rms: RmsDeviation
     leaving: Leaving
     lap: Floats
     """X_r(k) and its speeds over a lap: x, y, theta, v_r, w_r, shape (N, 5)."""
@@ -89,7 +90,7 @@ class Corridor:
             yield "Any outages up to n", self._any()
             if self.tube_reason != _NOT_ASKED:
                 yield "The same, proved", self._proved()
-        yield "RMS deviation", self._rms()
+        yield "RMS deviation", str(self.rms)
         yield "Probability to leave", self._probability()
         yield "Mean time to leave", _time(self.leaving.mean_time)
 
@@ -117,14 +118,6 @@ class Corridor:
             return f"{self.n_any_proved} slots: {off}, {self.covering.deviation:.3g} m with what is of second order"
         return f"{self.n_any_proved} slots: {off}; what is of second order could not be covered"
 
-    def _rms(self) -> str:
-        simulated = f"{self.leaving.rms:.3g} m in the simulated laps"
-        if self.stationary is None:
-            return f"{simulated}; not known to first order: {self.stationary_reason}"
-        if not math.isfinite(self.stationary.rms):
-            return f"{simulated}; to first order its mean square does not settle"
-        return f"{self.stationary.rms:.3g} m to first order, {simulated}"
-
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
         return f"{_percent(lap)} a lap, {_percent(hour)} an hour (by {self.leaving.method})"
@@ -150,11 +143,9 @@ class Corridor:
             "n_any_proved_reason": self.tube_reason or None,
             "tube_deviation": None if self.tube is None else self.tube.deviation,
             "tube_deviation_second_order": None if self.covering is None else self.covering.deviation,
-            "rms_deviation": None if self.stationary is None else finite(self.stationary.rms),
-            "rms_deviation_reason": self.stationary_reason or None,
+            **self.rms.to_json(),
             "rms_along": None if self.stationary is None else finite(self.stationary.rms_along),
             "rms_across": None if self.stationary is None else finite(self.stationary.rms_across),
-            "rms_simulated": finite(found.rms),
             **_estimates("p_lap", found.p_lap),
             **_estimates("p_hour", found.p_hour),
             **_estimates("mean_time_s", found.mean_time),
@@ -199,10 +190,12 @@ def corridor(
     # Noise and slip are not part of what is proved.
     covered = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else n_proved
     found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"), covered)
+    progress("the RMS deviation")
     stationary, why_not = _stationary(loop)
+    rms = rms_deviation(loop, chain_alone(scenario), stationary, why_not, found)
     return Corridor(
-        widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, stationary, why_not,
-        found, loop.lap, reason, tuple(_notes(loop, single, stationary)),
+        widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, stationary, rms,
+        found, loop.lap, reason, (*_notes(loop, single), *rms.notes()),
     )  # fmt: skip
 
 
@@ -228,7 +221,8 @@ def _any_outages(loop: LapLoop, single: SingleOutage) -> tuple[int | None, Worst
     if single.n == -1:
         return -1, None, "the AGV is outside without any"
     longest = _longest_any(single)
-    growing = _growing(loop, longest)
+    # Where an error stays without outages, too, as across the track of a parked AGV, they are not what keeps it.
+    growing = _growing(loop, longest) or None
     n, sequence = largest_n(loop, longest if growing is None else min(longest, growing - 1))
     if growing is not None and n == growing - 1:
         return n, sequence, f"with outages of {growing} slots, again and again, a small error does not die out"
@@ -290,7 +284,7 @@ def _growing(loop: LapLoop, longest: int) -> int | None:
     return joint_spectral_radius.first_refuted(linear.thinned(_PLACES) if linear.predicts else linear, longest)
 
 
-def _notes(loop: LapLoop, single: SingleOutage | None, stationary: StationaryDeviation | None) -> Iterator[str]:
+def _notes(loop: LapLoop, single: SingleOutage | None) -> Iterator[str]:
     share, policy = loop.loss_free_share, loop.scenario.error_detector.policy
     if 1.0 < share < _DIVERGED:
         yield f"without any outage the AGV uses {share:.3g} times the half-width: no outage can be survived in it"
@@ -298,11 +292,6 @@ def _notes(loop: LapLoop, single: SingleOutage | None, stationary: StationaryDev
         yield (
             "a single lost pose leads outside: an outdated pose is compared with the reference of now "
             "(error_detector.policy is hold), which align and predict do not do"
-        )
-    if stationary is not None and stationary.has_heavy_tail and math.isfinite(stationary.rms):
-        yield (
-            "the square of the deviation has no variance under this channel: long outages that hardly any simulated "
-            "lap shows make a large part of its mean, so the RMS of laps comes out too small"
         )
 
 

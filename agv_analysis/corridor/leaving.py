@@ -83,6 +83,18 @@ class Leaving:
         """RMS deviation of the simulated laps [m]; inf where one diverged."""
         return float(np.sqrt(self.mean_squares.mean()))
 
+    @property
+    def rms_interval(self) -> Estimate:
+        """The same with its 95 % interval, by the spread of the laps; of a single one, which is not random, itself."""
+        if len(self.mean_squares) < 2 or not math.isfinite(self.rms):
+            return Estimate(self.rms, self.rms, self.rms)
+        half = _NORMAL * float(self.mean_squares.std(ddof=1)) / math.sqrt(len(self.mean_squares))
+        return Estimate(self.rms, math.sqrt(max(0.0, self.rms**2 - half)), math.sqrt(self.rms**2 + half))
+
+
+_NORMAL = 1.96
+"""Quantile of the normal distribution for 95 %."""
+
 
 def leaving(
     loop: LapLoop, single: SingleOutage | None, laps: int | None = None,
@@ -113,7 +125,7 @@ def leaving(
     return _of_laps(loop, Estimate.of(left, laps), seconds / left if left else None, driven, method)
 
 
-_NEVER = 1e-30
+_NEVER = 1e-15
 """Expected number of times an hour below which it is not estimated how often the corridor is left."""
 
 _RARE = 0.2
@@ -168,6 +180,10 @@ def is_random(scenario: Scenario) -> bool:
     return plant.is_noisy or plant.slip_noise > 0.0 or any(map(_is_drawn, (relay.uplink, relay.downlink)))
 
 
+_ROUNDING = 1e-15
+"""Loss rate that is none."""
+
+
 def _is_drawn(link: ChannelParameters) -> bool:
     """Are outcomes or delays of a link random?"""
     if link.is_placed or link.jitter > 0.0:
@@ -175,6 +191,8 @@ def _is_drawn(link: ChannelParameters) -> bool:
     chain = chain_of(link)
     if chain is None:
         return link.model not in (TRACE, "perfect", "burst")
+    if chain.loss_rate < _ROUNDING:
+        return False
     chances = np.concatenate((chain.transition.ravel(), chain.delivery))
     return bool(((chances > 0.0) & (chances < 1.0)).any())
 

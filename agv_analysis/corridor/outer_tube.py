@@ -24,13 +24,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agv_analysis.compiled import compiled
+from agv_analysis.corridor.biases import Biases, biases, neighbours
 from agv_analysis.corridor.lap_loop import LapLoop, outage
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.run import Floats
@@ -65,14 +66,15 @@ _PARTS = 100
 _ROUNDS, _MORE = 12, 1.1
 """How often the tube is widened by the remainder that it has, and by how much more than that."""
 
+_APART, _BELOW = 5, 0.988
+"""Steps between receptions, at most, of a first look at outages that are LONG; share of the n found with which the tube
+of all is tried, which is wider by a hundredth or two."""
+
 _ROUNDING = 1e-9
 """Remainder that is none [m, m, rad]."""
 
 _REMAINDER_TIMES = 1.2
 """Factor on the largest remainder that was measured."""
-
-_LARGEST_BIAS = 3_000_000
-"""Rows of the b_i that are computed; in a longer lap those between are interpolated."""
 
 
 class Template(NamedTuple):
@@ -134,12 +136,14 @@ def applies_to(linear: LinearLoop) -> bool:
     return linear.size == linear.outputs == _ERRORS
 
 
-def outer_tube(loop: LapLoop, linear: LinearLoop, n: int) -> Tube | None:
-    """The tube for outages of up to `n` slots; None where it grows out of the corridor, or forever."""
-    bias = biases(loop, linear, n)
-    if not np.isfinite(bias.rows).all():
-        return None
-    return _tube(loop, linear, n, bias, np.zeros((1, n + 2, _ERRORS)))
+def outer_tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases | None = None, apart: int = 1) -> Tube | None:
+    """The tube for outages of up to `n` slots; None where it grows out of the corridor, or forever.
+
+    `bias` of no shorter ones, if it is known. Of receptions `apart` steps apart, a divisor of a lap, it is no wider
+    than of all, and bounds those steps alone.
+    """
+    bias = biases(loop, linear, n) if bias is None else bias.up_to(n)
+    return _tube(loop, linear, n, bias, np.zeros((1, n + 2, _ERRORS)), apart)
 
 
 def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tube | None]:
@@ -149,20 +153,49 @@ def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tub
     """
     if linear.is_exact:  # an outage leaves nothing, however long
         return longest, outer_tube(loop, linear, 0)
-    inside, outside, tube = -1, longest + 1, None
-    attempt = int(0.99 * longest) if longest > LONG else longest
-    while outside - inside > max(1, inside // 50):
-        found = outer_tube(loop, linear, attempt)
+    of_longest, predicts = biases(loop, linear, longest), linear.predicts
+    attempt, outside, apart = longest, longest + 1, _apart(loop, linear)
+
+    def of_few_receptions(n: int) -> Tube | None:
+        return outer_tube(loop, linear, n, of_longest, apart if n > LONG else 1)
+
+    if longest > LONG and apart > 1:
+        inside, outside, _ = _bracket(of_few_receptions, predicts, outside, attempt, _FINER)
+        attempt = max(0, int(_BELOW * inside) if inside > LONG else inside)
+    inside, _, tube = _bracket(lambda n: outer_tube(loop, linear, n, of_longest), predicts, outside, attempt, _FINE)
+    return inside, tube
+
+
+_FINE, _FINER = 50, 400
+"""The n of outages that are LONG is found to such a part of it, and that of receptions at some steps alone."""
+
+
+def _apart(loop: LapLoop, linear: LinearLoop) -> int:
+    """Steps between receptions that a lap is a multiple of, at most _APART."""
+    lap = 1 if linear.is_constant else loop.steps
+    return _APART if lap == 1 else max(apart for apart in range(1, _APART + 1) if lap % apart == 0)
+
+
+def _bracket(
+    tube_of: Callable[[int], Tube | None], predicts: bool, outside: int, attempt: int, part: int
+) -> tuple[int, int, Tube | None]:
+    """(largest n whose tube stays in the corridor or -1, one whose does not, the tube of the first).
+
+    Up to `outside`, which does not; `attempt` is tried first. To a `part` of n where that is LONG.
+    """
+    inside, tube = -1, None
+    while outside - inside > max(1, inside // part if inside > LONG else 0):
+        found = tube_of(attempt)
         # How far outages lead grows with their length behind a predictor, with its square where a pose is held.
-        expected = 0.0 if found is None else attempt / found.largest_share ** (1.0 if linear.predicts else 0.5)
+        expected = 0.0 if found is None else attempt / found.largest_share ** (1.0 if predicts else 0.5)
         if found is not None and found.largest_share <= 1.0:
             inside, tube = attempt, found
-            wanted = max(int(expected), inside + inside // 50) if inside > LONG else 0
+            wanted = max(int(expected), inside + inside // part) if inside > LONG else 0
         else:
             outside = attempt
-            wanted = int((0.99 if attempt > LONG else 1.0) * expected)
+            wanted = int((1.0 - 0.5 / part if attempt > LONG else 1.0) * expected)
         attempt = wanted if inside < wanted < outside else (inside + outside) // 2
-    return inside, tube
+    return inside, outside, tube
 
 
 def with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube) -> Tube | None:
@@ -183,56 +216,22 @@ def with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube) -> Tube | None
     return None
 
 
-class Biases(NamedTuple):
-    """b_i, and the errors of the loss-free motion."""
-
-    rows: Floats
-    """b_i of outages that begin at every so many steps of the lap, shape (., n + 2, 3); entry i: i slots after a
-    reception."""
-    every: int
-    nominal: Floats
-    """Shape (R, 3)."""
-
-    def at(self, steps: NDArray[np.int64]) -> Floats:
-        """Of outages that begin at these steps, which are interpolated linearly, shape (S, n + 2, 3)."""
-        lap, found = len(self.nominal), np.empty((len(steps), *self.rows.shape[1:]))
-        for row, step in enumerate(steps.tolist()):
-            before, after, share = neighbours(step % lap, self.every, len(self.rows), lap)
-            found[row] = (1.0 - share) * self.rows[before] + share * self.rows[after]
-        return found
-
-
-def neighbours(step: int, every: int, rows: int, lap: int) -> tuple[int, int, float]:
-    """(row before a step, row after it, share of the second) where there is a row for every so many steps of a lap."""
-    before = min(step // every, rows - 1)
-    width = every if before + 1 < rows else lap - before * every
-    return before, (before + 1) % rows, (step - before * every) / width
-
-
-def biases(loop: LapLoop, linear: LinearLoop, n: int) -> Biases:
-    """Of outages of `n` slots."""
-    lap = 1 if linear.is_constant else loop.steps
-    every = max(1, math.ceil(lap * (n + 2) / _LARGEST_BIAS))
-    _, (free,) = loop.excursions(np.zeros(lap + n + 2, dtype=np.bool_), loop.steps, kept=lap + n + 2, follow=False)
-    _, lost = loop.excursions(outage(n), loop.steps if linear.is_constant else every, kept=n + 2, follow=False)
-    for row, path in enumerate(lost):
-        path -= free[row * every : row * every + n + 2]
-    return Biases(lost, every, np.ascontiguousarray(free[:lap]))
-
-
-def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Floats) -> Tube | None:
-    """The tube with a given remainder; None where it grows out of the corridor, or forever."""
+def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Floats, apart: int = 1) -> Tube | None:
+    """As `outer_tube`, with a given remainder."""
+    if not np.isfinite(bias.rows).all():
+        return None
     rows, template = len(bias.nominal), template_of(linear, _SIDES_OF_LONG if n > LONG else _SIDES)
-    lap = -(-max(rows, n + 2, _WARM_UP) // rows) * rows  # in whole turns of the rows, longer than any memory
+    whole, warm_up = math.lcm(rows, apart), -(-_WARM_UP // apart) * apart
+    lap = -(-max(rows, n + 2, _WARM_UP) // whole) * whole  # in whole turns of the rows, longer than any memory
     widths = loop.widths
     limit = _FARTHER * min(widths.distance, max(widths.along, widths.across))
     window = np.zeros((n + 2, len(template.directions)))
     bounds = np.empty((lap, len(template.directions)))
     drive = compiled(_push, of_size_3(linear.F, linear.G))
     matrices = linear.F, linear.G, linear.H, linear.K
-    arguments = *matrices, bias.rows, bias.every, rows, remainder, template.directions, template.lever
-    begun = np.empty((_WARM_UP, len(template.directions)))
-    if not drive(*arguments, -_WARM_UP % rows, window, begun, limit):
+    arguments = *matrices, bias.rows, bias.every, rows, remainder, template.directions, template.lever, apart
+    begun = np.empty((warm_up, len(template.directions)))
+    if not drive(*arguments, -warm_up % rows, window, begun, limit):
         return None
     for _ in range(_LAPS):
         window += _SLACK * np.where(np.isfinite(window), np.abs(window) + 1e-6, 0.0)
@@ -240,16 +239,15 @@ def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Fl
         if not drive(*arguments, 0, window, bounds, limit):
             return None
         if (window <= before).all():
-            of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)
-            return Tube(
-                n, of_rows, template, bias.nominal, remainder, *_extent(of_rows, template, bias.nominal, widths)
-            )
+            of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)[::apart]
+            nominal = bias.nominal[::apart]
+            return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
     return None
 
 
 def _push(
     F: Floats, G: Floats, H: Floats | None, K: Floats | None, bias: Floats, every: int, lap: int, remainder: Floats,
-    directions: Floats, lever: float, first: int, window: Floats, bounds: Floats, limit: float,
+    directions: Floats, lever: float, apart: int, first: int, window: Floats, bounds: Floats, limit: float,
 ) -> bool:  # fmt: skip
     """Drive the bounds on: row j of `bounds` is that of step first + j; False where one leaves the limit.
 
@@ -271,6 +269,7 @@ def _push(
             bounds[j, i] = window[0, i]
         if not (max(window[0, 0], window[0, 1]) <= limit and max(window[0, 2], window[0, 2 + half]) <= limit):
             return False
+        until = longest if j % apart == 0 else 0
         for i in range(size):
             for p in range(size):
                 M[i, p] = N[i, p] = 1.0 if i == p else 0.0
@@ -279,7 +278,7 @@ def _push(
         begun = (first + j) % lap
         before, after, share = neighbours(begun, every, bias.shape[0], lap)
         part = begun * remainder.shape[0] // lap
-        for length in range(1, longest + 1):
+        for length in range(1, until + 1):
             row = (first + j + length - 1) % F.shape[0]
             multiply(F[row], M, False, M_next, False)
             multiply(G[row], N, False, M_next, True)
@@ -289,6 +288,8 @@ def _push(
                     multiply(K[row], M, False, N_next, True)
                 assign(N_next, N)
             assign(M_next, M)
+            if length % apart != 0:
+                continue
             b_x = (1.0 - share) * bias[before, length, 0] + share * bias[after, length, 0]
             b_y = (1.0 - share) * bias[before, length, 1] + share * bias[after, length, 1]
             b_t = (1.0 - share) * bias[before, length, 2] + share * bias[after, length, 2]

@@ -26,17 +26,15 @@ from agv_analysis.compiled import compiled, numbers
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats
-from agv_analysis.simulation.loop import history
+from agv_analysis.simulation.loop import Rows, Settings, history, reference_at
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.single import settings_of
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.mean_square import spectral_radius
 from agv_analysis.stability.products import multiply
-from agv_cloud.reference.point import ReferencePoint
 from agv_cloud.staleness.estimate import staleness_policy
 from agv_cloud.tracking_error import tracking_error
 from agv_ros.pose import Pose
-from agv_ros.substitution import replaced
 
 _LAPS, _SETTLED = 60, 1e-7
 """Laps that are driven at most, and relative change of the RMS from one to the next at which it has settled."""
@@ -56,6 +54,8 @@ class StationaryDeviation:
     mean_square_across: Floats
     has_heavy_tail: bool = False
     """Do the squares have no variance? Then outages that hardly any run shows make a large part of their mean."""
+    drift: float = 0.0
+    """Largest error along the track that a held pose adds in a step [m]."""
 
     @property
     def rms(self) -> float:
@@ -93,7 +93,7 @@ def stationary_deviation(loop: LapLoop, linear: LinearLoop, chain: Chain) -> Sta
     moments = np.zeros((len(chain.delivery), m + q + 1, m + q + 1))
     moments[:, -1, -1] = chain.stationary
     found = _settled(received, lost, noise, chain, moments, nominal, loop)
-    return replace(found, has_heavy_tail=_fourth_moments_grow(linear, chain))
+    return replace(found, has_heavy_tail=_fourth_moments_grow(linear, chain), drift=float(np.abs(drift[:, 0]).max()))
 
 
 def _fourth_moments_grow(linear: LinearLoop, chain: Chain) -> bool:
@@ -115,17 +115,26 @@ def nominal_and_drift(loop: LapLoop) -> tuple[Floats, Floats]:
     rows, n_ul = np.full((2 * steps + 1, 8), math.nan), np.empty(2 * steps + 1, dtype=np.int64)
     inputs = loop.inputs(np.zeros(2 * steps + 1, dtype=np.bool_))
     run_parts(history, replacements_of(scenario), numbers(reference), inputs, rows, n_ul)
-    policy, ahead = replaced(staleness_policy, replacements_of(scenario)), scenario.controller.steps_ahead
-    drift, driven, points = np.empty((steps, 3)), rows[steps:].tolist(), reference[steps + ahead :].tolist()
-    for k in range(steps):
-        x, y, theta, *_, v, w = driven[k]
-        held, target = policy(
-            s.policy, Pose(x, y, theta), Pose(*points[k][:3]), ReferencePoint(*points[k + 1]), v, w, s.ts, s.model_arc,
-            s.policy_parameters,
+    drift, ahead = np.empty((steps, 3)), scenario.controller.steps_ahead
+    points = np.ascontiguousarray(reference[steps + ahead :])
+    run_parts(held_drift, replacements_of(scenario), numbers(rows[steps:]), numbers(points), s, drift)
+    return rows[steps : 2 * steps, 3:6], drift
+
+
+def held_drift(driven: Rows, points: Rows, s: Settings, drift: Floats) -> None:
+    """What the policy makes of each pose of a path with its commands after a step, less the path's error there.
+
+    Rows of `driven`: pose, error, command; of `points`: the reference that the edge compares with.
+    """
+    for k in range(len(drift)):
+        now, at = driven[k], reference_at(points, k)
+        held, target = staleness_policy(
+            s.policy, Pose(now[0], now[1], now[2]), Pose(at.x, at.y, at.theta), reference_at(points, k + 1), now[6],
+            now[7], s.ts, s.model_arc, s.policy_parameters,
         )  # fmt: skip
         error = tracking_error(target[0], target[1], target[2], held[0], held[1], held[2])
-        drift[k] = np.subtract(error, driven[k + 1][3:6])
-    return rows[steps : 2 * steps, 3:6], drift
+        for i in range(3):
+            drift[k, i] = error[i] - driven[k + 1][3 + i]
 
 
 def _noise(loop: LapLoop, N: Floats, q: int) -> Floats:

@@ -42,7 +42,7 @@ def _values(found: Corridor) -> tuple[float, ...]:
     n_single, n_any = (
         (math.inf if n is None else float(n)) if is_known else math.nan for n in (found.n_single, found.n_any)
     )
-    rms = math.nan if found.stationary is None else found.stationary.rms
+    rms = math.nan if found.stationary is None or found.rms.value is None else found.rms.value
     p_lap, p_hour = leaving.p_lap, leaving.p_hour
     mean = math.inf if leaving.mean_time is None else leaving.mean_time.value
     return n_single, n_any, p_lap.value, p_lap.low, p_lap.high, p_hour.value, p_hour.low, p_hour.high, mean, rms

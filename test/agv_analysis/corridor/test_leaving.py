@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agv_analysis.corridor.corridor import corridor
 from agv_analysis.corridor.lap_loop import LapLoop
-from agv_analysis.corridor.leaving import Leaving, leaving
+from agv_analysis.corridor.leaving import Leaving, is_random, leaving
 from agv_analysis.corridor.rare_leaving import leaving_rate
 from agv_analysis.corridor.shares import path_deviation
 from agv_analysis.corridor.single_outage import single_outage
@@ -81,3 +82,16 @@ def test_laps_are_parts_of_a_long_measured_link(tmp_path: Path) -> None:
     found = of(0.25, *settings)
     assert found.method == "5 simulated laps, 1 of which left it"
     assert np.flatnonzero(found.largest > 1.0).tolist() == [3]
+
+
+def test_a_channel_that_never_loses_leaves_nothing_to_chance() -> None:
+    assert not is_random(scenario("relay.uplink.p=0.0"))
+    assert is_random(scenario())
+
+
+def test_a_parked_agv_stays_whatever_is_lost() -> None:
+    parked = "error_detector.track=line", "error_detector.speed=1e-300", "error_detector.corridor=0.25"
+    found = corridor(scenario(*parked), laps=2, proved=False)
+    assert found is not None
+    assert (found.n_single, found.n_any) == (None, None)
+    assert found.leaving.p_lap.value == 0.0

@@ -9,7 +9,7 @@ import pytest
 
 from agv_analysis.corridor.lap_loop import LapLoop, Outcomes
 from agv_analysis.corridor.outage_sequences import worst_sequence
-from agv_analysis.corridor.outer_tube import Tube, largest_n, outer_tube, with_remainder
+from agv_analysis.corridor.outer_tube import LONG, Tube, largest_n, outer_tube, with_remainder
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import loop_on_lap
@@ -85,6 +85,18 @@ def test_what_is_proved_is_never_more_than_what_is_refuted() -> None:
 def test_outages_that_let_errors_grow_have_no_tube() -> None:
     loop, linear = of(1.0, "error_detector.track=line")
     assert outer_tube(loop, linear, 16) is None
+
+
+def test_fewer_receptions_leave_a_tube_that_is_hardly_narrower_and_the_largest_n_is_that_of_all() -> None:
+    loop, linear = of(0.1, "error_detector.policy=predict", "plant.speed_scale=1.1", "error_detector.track=line")
+    n, found = largest_n(loop, linear, 300)
+    assert found is not None
+    assert LONG < n < 300
+    assert found.largest_share <= 1.0
+    wider, few = outer_tube(loop, linear, n + n // 50 + 1), outer_tube(loop, linear, n, apart=5)
+    assert wider is None or wider.largest_share > 1.0
+    assert few is not None
+    assert 0.95 * found.largest_share < few.largest_share <= found.largest_share
 
 
 def test_behind_an_exact_predictor_there_is_nothing_to_bound() -> None:

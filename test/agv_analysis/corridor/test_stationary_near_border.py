@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from agv_analysis.corridor.sampled_deviation import sampled_deviation
 from agv_analysis.corridor.stationary_deviation import stationary_deviation
 from agv_analysis.link.markov_channel import gilbert_elliott
 from agv_analysis.run import Floats
@@ -108,6 +109,12 @@ def test_it_is_that_of_runs_that_show_the_rare_outages(track: str, r: float, rat
     assert expected.has_heavy_tail
     assert half < 0.025 * found
     assert expected.rms == pytest.approx(ratio * found, rel=0.03)
+    a = loop.linear.along_gain
+    assert a is not None
+    sampled = sampled_deviation(loop, gilbert_elliott(0.02, r), a, expected.drift)
+    assert sampled is not None
+    assert sampled.low - half <= found <= sampled.high + half
+    assert sampled.high - sampled.low < 0.05 * found
 
 
 def test_where_outages_are_short_the_square_has_a_variance() -> None:
