@@ -110,11 +110,6 @@ class ErrorDetectorParameters(_OwnErrorDetectorParameters):
             )
         if self.track == CSV and not self.track_file:
             raise ParameterError("error_detector.track is csv, but error_detector.track_file is empty: name a file")
-        if self.corridor == 0.0 < self.corridor_along:
-            raise ParameterError(
-                f"error_detector.corridor_along is {self.corridor_along!r}, but error_detector.corridor, the "
-                "half-width across the track, is 0: name that, too (--corridor)"
-            )
         if self.lap_time < 16.0 * self.ts:
             raise ParameterError(
                 f"error_detector.lap_time must be at least 16 ts = {16.0 * self.ts:g} s, got {self.lap_time!r}"
