@@ -59,7 +59,7 @@ def compiled_over_lanes(function: Function, constants: tuple[tuple[str, Any], ..
     """`function`, whose innermost loop is one over lanes, compiled so that this loop can be vectorised; needs numba.
 
     In its globals `constants` stand by name, and beside them `load_lane` and `store_lane` of `lane_memory`. Whether it
-    has been vectorised or not, and by vectors of which length, the numbers are the same on one kind of processor.
+    has been vectorised or not, and by vectors of which length, the numbers are the same: no operation is contracted.
     """
     with _COMPILING:
         return _compiled_over_lanes(function, constants)
@@ -76,12 +76,10 @@ def _compiled_over_lanes(function: Function, constants: tuple[tuple[str, Any], .
 @functools.cache
 def _over_lanes() -> _Way:
     """How functions are compiled over lanes."""
-    # Products and sums of the polynomials may become one operation with one rounding, which is not less accurate.
-    fused = _Way({"fastmath": {"contract"}}, {})
     module, made = types.ModuleType("math over lanes"), dict[Function, Any]()
     vars(module).update({name: value for name, value in vars(math).items() if not name.startswith("__")})
     for name, function in (("sin", sine), ("cos", cosine)):
-        setattr(module, name, _inlined(function, {}, made, fused))
+        setattr(module, name, _inlined(function, {}, made, _PLAINLY))
     return _Way({"error_model": "numpy"}, {"math": module})
 
 
