@@ -7,6 +7,7 @@ import html
 import importlib.util
 import json
 import math
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -446,7 +447,8 @@ def test_the_page_has_every_claim_once_beside_its_figure(made: Made) -> None:
     assert {key for keys in SHOWN_IN.values() for key in keys} < set(EXPECTED)
     _, _, behind = page.partition("Fig. 3b: ")
     assert behind.index("1/K_x is the time constant") < behind.index("Fig. 3c: ")
-    assert "e+1" not in page.partition("future work")[2]
+    words = re.sub(r"base64,[^\"]*", "", page)
+    assert "e+1" not in words.partition("future work")[2]
 
 
 def test_a_directory_that_cannot_be_made_is_one_line(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
