@@ -33,7 +33,7 @@ _NONE = 1e-9
 
 @dataclass(frozen=True)
 class RmsDeviation:
-    """RMS distance from the reference in the long run [m]."""
+    """Stationary RMS distance from the reference [m]."""
 
     value: float | None
     """None: to first order it settles, but nothing says whether the whole loop's is that; inf: it does not settle."""

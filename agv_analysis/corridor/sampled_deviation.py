@@ -62,7 +62,7 @@ class Draws(NamedTuple):
 
 
 def sampled_deviation(loop: LapLoop, chain: Chain, a: float, drift: float) -> Estimate | None:
-    """RMS distance from the reference in the long run [m], with its 95 % interval.
+    """Stationary RMS distance from the reference [m], with its 95 % interval.
 
     `a`, `drift`: of the error along a straight track, T_s K_x and what a held pose adds to it in a step [m]. None where
     the intervals between receptions depend on each other, errors take too long to die out, or the loop diverges.
