@@ -51,7 +51,7 @@ class LinkEmulatorNode(LoopNode[LinkEmulatorParameters]):
         super().__init__("link_emulator", LinkEmulatorParameters, **node_options)
         settings = self.settings
         agv, edge = self.in_domain(settings.plant_domain_id), self.in_domain(settings.edge_domain_id)
-        self.place = NOWHERE
+        self.place, self._decode_pose = NOWHERE, pose_decoder(settings.pose_type)
         self.under_way: UnderWay[Deliver] = UnderWay()
         self.topics: list[EmulatedTopic] = []
         self.links: dict[str, list[MessageLink]] = {}
@@ -115,7 +115,7 @@ class LinkEmulatorNode(LoopNode[LinkEmulatorParameters]):
             topic.look()
 
     def _on_pose(self, data: bytes) -> None:
-        self.place = pose_decoder(self.settings.pose_type)(data)[1:3]
+        self.place = self._decode_pose(data)[1:3]
 
     def _report_now(self) -> None:
         self._last_ns = self.get_clock().now().nanoseconds

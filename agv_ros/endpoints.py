@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
 from typing import NamedTuple
 
 from rclpy.duration import Duration, Infinite
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 from agv_ros.errors import UserError
 from agv_ros.stamps import to_nanoseconds
@@ -139,6 +141,14 @@ def offer_of(node: Node, topic: str) -> Offer | None:
 def _longest(durations: list[Duration]) -> Duration | None:
     limited = [duration for duration in durations if 0 < duration.nanoseconds < Infinite.nanoseconds]
     return max(limited, key=lambda duration: duration.nanoseconds) if len(limited) == len(durations) else None
+
+
+def take_all(subscription: Subscription) -> Iterator[tuple[bytes, int]]:
+    """What has come without an executor: each serialised message, and when it was received [ns since 1970]."""
+    with subscription.handle:
+        while (message := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+            data, about = message
+            yield data, int(about["received_timestamp"])
 
 
 def message_class(type_name: str) -> type:

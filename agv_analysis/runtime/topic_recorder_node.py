@@ -18,7 +18,7 @@ from agv_analysis.bags.message_definitions import schema_of
 from agv_analysis.bags.rosbag2_metadata import TopicInfo
 from agv_analysis.bags.writer import BagWriter
 from agv_ros.discovery import discovery_note
-from agv_ros.endpoints import WATCHER, Offer, message_class, offer_of
+from agv_ros.endpoints import WATCHER, Offer, message_class, offer_of, take_all
 from agv_ros.errors import UserError
 from agv_ros.stopping import stop_on_signals
 
@@ -99,10 +99,7 @@ class _Listener:
     def taken(self) -> Iterator[tuple[bytes, int]]:
         """What has come since the last call: the message, and when it was received [ns since 1970]."""
         assert self._subscription is not None
-        with self._subscription.handle:
-            while (message := self._subscription.handle.take_message(self._subscription.msg_type, True)) is not None:
-                data, about = message
-                yield data, int(about["received_timestamp"])
+        return take_all(self._subscription)
 
 
 def _described(listener: _Listener) -> TopicInfo:

@@ -31,7 +31,7 @@ from agv_analysis.watch.message_log import Heard
 from agv_analysis.watch.remote_parameters_node import RemoteParameters
 from agv_analysis.watch.watch_page import served
 from agv_analysis.watch.watch_session import TICK, WatchSession
-from agv_ros.endpoints import WATCHER
+from agv_ros.endpoints import WATCHER, take_all
 from agv_ros.errors import UserError
 from agv_ros.node import ENDED
 from agv_ros.stopping import stop_on_signals
@@ -120,10 +120,8 @@ class WatcherNode:
 
     def _taken(self) -> Iterator[Heard]:
         for (number, _, _), heard in zip(self._topics, self._heard, strict=True):
-            with heard.handle:
-                while (message := heard.handle.take_message(heard.msg_type, True)) is not None:
-                    data, about = message
-                    yield Heard(number, data, int(about["received_timestamp"]))
+            for data, received_ns in take_all(heard):
+                yield Heard(number, data, received_ns)
 
     def reports_in(self, data: bytes) -> Iterator[tuple[str, dict[str, str], bool]]:
         """What each node of this loop says in a message of diagnostics: its name, its facts, and has it ended?"""
