@@ -51,9 +51,9 @@ def imported(source: str) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield node.module.partition(".")[0]
         elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "_needed")):
-            named = node.args[0]
-            if isinstance(named, ast.Constant):
-                yield str(named.value).partition(".")[0]
+            yield from (
+                str(named.value).partition(".")[0] for named in node.args[:1] if isinstance(named, ast.Constant)
+            )
 
 
 @functools.cache
