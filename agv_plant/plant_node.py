@@ -104,6 +104,10 @@ class PlantNode(LoopNode[PlantParameters]):
         if math.isfinite(self.steps):
             self.failure = f"{self.get_name()} was {STOPPED_BY}{reason} at {progress_line(self.k, self.steps)}"
 
+    def is_settled(self) -> bool:
+        """The loop ends with its clock: what is under way to the AGV belongs to a step that it does not finish."""
+        return True
+
     @property
     def state(self) -> Pose:
         """The true pose."""

@@ -8,7 +8,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -50,8 +50,22 @@ _OFFERS_PERIOD = 0.25
 _ACK_PERIOD = 0.1
 """For how long [s] at a time a node waits until its subscribers have acknowledged what it has sent."""
 
+_QUIET = 0.02
+"""A node that is stopped has taken what was under way to it when nothing more has come for so long [s]."""
+
 ENDED = "ended"
 """Key in a node's last diagnostics: its counts of messages there are final."""
+
+
+class _Settling(NamedTuple):
+    """A node that is stopped, and takes what is under way to it."""
+
+    received: int
+    """Messages so far."""
+    since: float
+    """When the last one was noticed, by the steady clock [s]."""
+    give_up: float
+    """When others are waited for no longer [s]."""
 
 
 class LoopNode(Node, Generic[P]):
@@ -69,6 +83,9 @@ class LoopNode(Node, Generic[P]):
         """Messages by topic that must not enter the loop."""
         self.survived: Counter[str] = Counter()
         """Errors of other callbacks by their kind."""
+        self.received: Counter[str] = Counter()
+        """Messages that have come, by full name of the topic."""
+        self._settling = _Settling(-1, 0.0, math.inf)
         self.finished = False
         self.failure = ""
         self.outputs: list[Output] = []
@@ -142,6 +159,9 @@ class LoopNode(Node, Generic[P]):
         """
 
         def receive(data: bytes) -> None:
+            if self._ended:  # its last report has said how many messages it has published
+                return
+            self.received[full_name] += 1
             try:
                 callback(data)
             except UserError:  # no other message can repair that
@@ -151,11 +171,13 @@ class LoopNode(Node, Generic[P]):
 
         where, wanted = on or self, self.settings.wait_for_subscribers
         self._unheard[topic] = feeds
+        full_name = where.resolve_topic_name(topic)
 
         def subscribe_when_heard() -> bool:
             if not all(output.is_heard(wanted) for output in feeds):
                 return False
             del self._unheard[topic]
+            self.received[full_name] = 0
             self._inputs.append(Input(where, kind, topic, receive, self.get_logger().warning))
             return True
 
@@ -205,13 +227,28 @@ class LoopNode(Node, Generic[P]):
         self.get_logger().info(f"{STOPPED_BY}{reason}")
 
     def is_settled(self) -> bool:
-        """Has everything that is on its way to this node arrived? Polled for a moment when the node is stopped."""
-        return True
+        """Has everything that is on its way to this node arrived? Polled for a moment when the node is stopped.
+
+        Where its peers go on, there is always more: after half of `stop_timeout` it has.
+        """
+        now, count, before = time.monotonic(), self.received.total(), self._settling
+        if count != before.received:
+            give_up = min(before.give_up, now + self.settings.stop_timeout / 2.0)
+            self._settling = _Settling(count, now, give_up)
+        return now - self._settling.since > _QUIET or now > self._settling.give_up
 
     def close(self) -> None:
-        """Called once, after the last callback: report for the last time what was published."""
+        """Report for the last time what was published. From then on the node acts on nothing that comes or is due."""
+        if self._ended:
+            return
         self._ended = True
+        for timer in self.timers:
+            timer.cancel()
         self.report(self._last_ns)
+
+    def has_received(self, published: Counter[str]) -> bool:
+        """Has all come here of what was published, by full name of the topic? A node that was closed awaits nothing."""
+        return self._ended or all(count >= published[topic] for topic, count in self.received.items())
 
     def flush(self, seconds: float, is_hurried: Callable[[], bool] = lambda: False) -> None:
         """Wait until all that was published has arrived, `seconds` at most: a dead subscriber acknowledges nothing."""

@@ -81,6 +81,8 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     ended = [node for node in nodes.values() if node.is_ending()]
     halted = [node for node in nodes.values() if node.is_halted()]
     is_cut_off = halted or any(node.killed_by for node in ended)
+    if not is_cut_off:
+        _end_upstream_first(nodes, stop)
     _end(nodes, stop, _SHORT_TIMEOUT if is_cut_off else _STOP_TIMEOUT)
     progress(plant.steps)
     recording = recorder.last_line() if recorder else ""
@@ -100,6 +102,12 @@ def _failure(plant: _Process, ended: Sequence[_Process], halted: Sequence[_Proce
         return f"{'; '.join(stopped)}, after step {plant.steps}"
     said = [node.last_line() if node is plant else f"{node.name} ended: {node.last_line()}" for node in ended]
     return "; ".join([*said, *(f"{node.name} is halted by a signal" for node in halted)])
+
+
+def _end_upstream_first(nodes: Mapping[str, _Process], stop: Stop) -> None:
+    """End the nodes in the order of the loop, so that each answers what the one before it has sent."""
+    for name in SCHEMAS:
+        _end_all([nodes[name]], stop, _STOP_TIMEOUT)
 
 
 def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -175,8 +176,13 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
         spin(executor, watch.is_done)
         watch.look()
     finally:  # whatever ended the loops, what was recorded is kept
-        deadline = time.monotonic() + PATIENCE
         nodes = [node for loop in loops for node in loop.nodes]
+        for loop in loops:
+            loop.plant.close()
+        # What the others have yet to answer would be missing from the bag.
+        patience = max(node.settings.stop_timeout for node in nodes)
+        spin_for(executor, lambda: stop.insisted or _is_quiet(nodes), patience)
+        deadline = time.monotonic() + PATIENCE
         for node in nodes:
             node.close()
         recorders = [(loop.recorder, len(loop.nodes)) for loop in loops if loop.recorder]
@@ -191,6 +197,15 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
             recorder.close()
         executor.shutdown()
     return [loop.outcome(pace.rate, stop.requested) for loop, pace in zip(loops, watch.paces, strict=True)]
+
+
+def _is_quiet(nodes: Sequence[LoopNode[Any]]) -> bool:
+    """Has all arrived that these nodes have sent each other?"""
+    published: Counter[str] = Counter()
+    for node in nodes:
+        for output in node.outputs:
+            published[output.topic] += output.count
+    return all(node.has_received(published) for node in nodes)
 
 
 class _Watch:

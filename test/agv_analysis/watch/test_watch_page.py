@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +24,14 @@ pytest.importorskip("rclpy", reason="needs ROS 2")
 pytest.importorskip("flask", reason="needs Flask: pip install '.[explore]'")
 
 from agv_analysis.bags import read_bag
+from agv_analysis.recordings.messages_on_steps import stamps_of
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.run import Run
 from agv_analysis.runtime.run_setup import params_file
 from agv_analysis.runtime.runner import run_in_process
 from agv_analysis.scenario import load_scenario
 from agv_analysis.watch.beside_run import watcher_beside
+from agv_analysis.watch.live_loop import TOPICS
 from agv_cloud.reference.reference import Reference
 from test.test_loop import changed_topics
 
@@ -164,11 +167,11 @@ def _refused(address: str) -> Iterator[tuple[str, int]]:
 
 def test_the_numbers_on_the_page_are_those_in_the_bag(watched: Watched) -> None:
     run, now, bag = watched.run(), watched.now, read_bag(watched.bag)
-    assert (now["first"], now["slots"] + now["skipped"]) == (0, now["k"] + 1)
-    # A relay that is stopped may answer one more pose, after it has said how many it has answered.
-    unseen = now["skipped"] + now["k"] - int(run.k[-1])
-    assert 0 <= unseen <= now["skipped"] + 1
-    assert abs(now["lost"] - int(run.lost.sum())) <= unseen
+    assert now["first"] + now["slots"] + now["skipped"] == now["k"] + 1
+    # The page asks for best effort: on a busy machine it misses slots, and the bag does not.
+    unseen = len(run) - now["slots"]
+    assert 0 <= unseen < len(run) / 2
+    assert 0 <= int(run.lost.sum()) - now["lost"] <= unseen
     k, poses = now["deviation_k"], bag["/agv/pose"]
     x, y = (float(poses[f"pose.position.{axis}"][k]) for axis in "xy")
     reference = Reference(run.scenario.error_detector)[k]
@@ -181,15 +184,21 @@ def test_the_numbers_on_the_page_are_those_in_the_bag(watched: Watched) -> None:
 
 
 def test_the_strip_is_what_the_bag_holds(watched: Watched) -> None:
-    run, count = watched.run(), len(watched.points)
-    assert count >= 10
-    steps = count * 10
-    distance = np.hypot(*(run.pose - run.reference[:, :3])[:steps, :2].T)
-    points = np.array(watched.points, dtype=np.float64)
-    np.testing.assert_allclose(points[:, 3], distance.reshape(count, 10).max(axis=1), rtol=0.0, atol=1e-4)
-    np.testing.assert_array_equal(points[:, 6], run.lost[:steps].reshape(count, 10).sum(axis=1))
-    np.testing.assert_allclose(points[:, 5], 0.005 * run.n_ul[:steps].reshape(count, 10).max(axis=1), atol=1e-4)
-    np.testing.assert_allclose(points[:, 4], run.command[9:steps:10, 0], rtol=0.0, atol=1e-4)
+    """At the points of which the watcher has missed no message, as the bag that it has saved says."""
+    run, heard = watched.run(), read_bag(watched.saved)
+    seen = [set(stamps_of(heard[f"/{topic}"]).tolist()) for topic in ("agv/pose", "edge/slot", "edge/cmd_vel")]
+    steps = np.arange(len(run) // 10 * 10).reshape(-1, 10)
+    stamps = run.scenario.grid.start_ns + run.scenario.grid.ts_ns * steps
+    is_whole = np.array([set(ten) <= seen[0] & seen[1] & seen[2] for ten in stamps.tolist()])
+    number = np.rint((np.array(watched.points, dtype=np.float64)[:, 0] - 0.045) / 0.05).astype(int)
+    is_compared = np.isin(number, np.flatnonzero(is_whole))
+    points, steps = np.array(watched.points, dtype=np.float64)[is_compared], steps[number[is_compared]]
+    assert len(points) >= 10
+    distance = np.hypot(*(run.pose - run.reference[:, :3])[:, :2].T)
+    np.testing.assert_allclose(points[:, 3], distance[steps].max(axis=1), rtol=0.0, atol=1e-4)
+    np.testing.assert_array_equal(points[:, 6], run.lost[steps].sum(axis=1))
+    np.testing.assert_allclose(points[:, 5], 0.005 * run.n_ul[steps].max(axis=1), atol=1e-4)
+    np.testing.assert_allclose(points[:, 4], run.command[steps[:, -1], 0], rtol=0.0, atol=1e-4)
 
 
 def test_the_next_20_are_lost_and_the_bag_says_why(watched: Watched) -> None:
@@ -201,7 +210,7 @@ def test_the_next_20_are_lost_and_the_bag_says_why(watched: Watched) -> None:
     assert lost == list(range(end + 1 - len(lost), end + 1))
     # On a machine that is too busy the relay may know of it too late, which the page then says.
     assert len(lost) == 20 or "only at slot" in watched.said["lose20"]
-    assert watched.now["longest"] >= len(lost)
+    assert watched.now["longest"] >= len(lost) - watched.now["skipped"]
 
 
 def test_a_slider_sets_the_node_s_parameter(watched: Watched) -> None:
@@ -211,12 +220,13 @@ def test_a_slider_sets_the_node_s_parameter(watched: Watched) -> None:
 
 
 def test_what_is_saved_is_what_the_recorder_has(watched: Watched) -> None:
-    run, saved = watched.run(), read_run(watched.saved)
-    assert len(saved) > 150
-    assert not saved.unexplained
-    np.testing.assert_array_equal(saved.pose[:, :2], run.pose[saved.k][:, :2])
-    np.testing.assert_array_equal(saved.lost, run.lost[saved.k])
-    assert saved.scenario.relay.uplink.p == 0.05
+    bag, saved = read_bag(watched.bag), read_bag(watched.saved)
+    for topic in (f"/{topic.strip('/')}" for topic in TOPICS):
+        recorded = Counter(bag.payloads(topic))
+        assert not Counter(saved.payloads(topic)) - recorded
+    run = read_run(watched.saved)
+    assert len(run) > 150
+    assert run.scenario.relay.uplink.p == 0.05
 
 
 def test_the_button_stop_ends_the_run_in_order(watched: Watched) -> None:
