@@ -110,6 +110,11 @@ class ErrorDetectorParameters(_OwnErrorDetectorParameters):
             )
         if self.track == CSV and not self.track_file:
             raise ParameterError("error_detector.track is csv, but error_detector.track_file is empty: name a file")
+        if self.corridor_along > 0.0 and self.corridor == 0.0:
+            raise ParameterError(
+                f"error_detector.corridor_along is {self.corridor_along:g}, but error_detector.corridor is 0: name the "
+                "corridor's half-width across the track, too"
+            )
         if self.lap_time < 16.0 * self.ts:
             raise ParameterError(
                 f"error_detector.lap_time must be at least 16 ts = {16.0 * self.ts:g} s, got {self.lap_time!r}"

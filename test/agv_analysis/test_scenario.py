@@ -78,6 +78,7 @@ def test_a_misspelt_section_is_not_ignored(title: str, meant: str) -> None:
         ("error_detector: {ros__parameters: {policy: guess}}", "error_detector.policy must be one of hold"),
         ("plant: {ros__parameters: {integration: rk4}}", "plant.integration must be one of euler, arc, got 'rk4'"),
         ("plant: {ros__parameters: {initial_pose: [0.0, 5.0]}}", "plant.initial_pose must be 3 finite numbers, got 2"),
+        ("error_detector: {ros__parameters: {corridor_along: 1.0}}", "but error_detector.corridor is 0: name the"),
         ("plant: {ros__parameters: {duration: 0.0}}", "plant.duration must be in (0, inf], got 0.0"),
         ("error_detector: {ros__parameters: {track: csv}}", "error_detector.track_file is empty: name a file"),
         (
@@ -122,7 +123,7 @@ def values_of(found: Parameter) -> st.SearchStrategy[Any]:
 
 ALONE = {
     "track", "wait_for_subscribers", "stop_timeout", "frame_prefix", "plan_steps", "downlink_policy", "look_ahead",
-    "stamp_window",
+    "stamp_window", "corridor_along",
     *(f"{link}.{name}" for link in ("uplink", "downlink")
       for name in ("schedule", "hole_circles", "hole_polygons", "reliable")),
 }  # fmt: skip
