@@ -65,7 +65,7 @@ class _OnceToTerminal(logging.Handler):
 
 
 def _announce_compilation() -> None:
-    log = logging.getLogger("agv_analysis.compiled")
+    log = logging.getLogger("agv_analysis.compiled.functions")
     log.setLevel(logging.INFO)
     log.propagate = False
     log.handlers[:] = [_OnceToTerminal()]

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled
-from agv_analysis.lane_rows import LANES
+from agv_analysis.compiled.functions import compiled
+from agv_analysis.compiled.lane_rows import LANES
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import simulate_batch
 from agv_analysis.simulation.batch import cores

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.corridor.lap_loop import LapLoop, Outcomes
 from agv_analysis.corridor.outer_tube import Tube, outer_tube, with_remainder
 from agv_analysis.corridor.widths import Widths

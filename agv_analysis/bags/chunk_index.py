@@ -8,7 +8,7 @@ import numpy as np
 
 from agv_analysis.bags.message_batch import Bytes, Ints, number
 from agv_analysis.bags.records import MESSAGE, MESSAGE_HEAD, RECORD
-from agv_analysis.compiled import HAS_NUMBA, compiled
+from agv_analysis.compiled.functions import HAS_NUMBA, compiled
 
 _RECORD = RECORD.size
 

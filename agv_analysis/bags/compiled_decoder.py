@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from agv_analysis.bags.checks import is_fraction
 from agv_analysis.bags.layout import LEAD, Layout
 from agv_analysis.bags.message_batch import Bytes, Ints, number
-from agv_analysis.compiled import HAS_NUMBA, compiled
+from agv_analysis.compiled.functions import HAS_NUMBA, compiled
 from agv_ros.stamps import NS_PER_S
 
 MAX_LAYOUTS = 32

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.corridor.excursions import COLUMNS, Plan, excursions
 from agv_analysis.corridor.shares import along_and_across, path_shares, shares_of
 from agv_analysis.corridor.widths import Widths

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.rare_leaving import leaving_rate, outages_of
 from agv_analysis.corridor.shares import path_shares

@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.corridor.biases import Biases, biases, neighbours
 from agv_analysis.corridor.lap_loop import LapLoop, outage
 from agv_analysis.corridor.widths import Widths

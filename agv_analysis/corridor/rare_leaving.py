@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.splitting import REPLICATES, Rate, Work, advance, age_levels, rate_of
 from agv_analysis.corridor.widths import Widths, deviation, share_of

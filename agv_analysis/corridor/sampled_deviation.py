@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.corridor.excursions import loss_free
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.rare_leaving import draw_normals

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.link.markov_channel import Chain
 from agv_analysis.run import Floats

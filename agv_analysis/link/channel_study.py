@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.link.channel_fit import ChannelFit, fit_channel
 from agv_analysis.link.markov_channel import Chain, chain_of
 from agv_analysis.metrics.outages import LinkOutages, Outcomes, Steps, ages, link_outages

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.delay import whole_slots

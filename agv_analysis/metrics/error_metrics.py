@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.metrics.bands import NEGLIGIBLE, SHARE, TOLERANCE
 from agv_analysis.run import Floats
 from agv_cloud.tracking_error import tracking_error

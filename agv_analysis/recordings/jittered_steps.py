@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.recordings.messages_on_steps import Steps
 from agv_analysis.run import Floats
 

@@ -14,8 +14,8 @@ from typing import get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import HAS_NUMBA, numbers
-from agv_analysis.lane_rows import LANES
+from agv_analysis.compiled.functions import HAS_NUMBA, numbers
+from agv_analysis.compiled.lane_rows import LANES
 from agv_analysis.metrics.order_statistics import distances_of
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.simulation.link_loop import LinkInputs
 from agv_analysis.simulation.noise import normals
 from agv_plant.channels.model import GOOD

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario

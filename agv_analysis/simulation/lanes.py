@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import compiled_over_lanes
-from agv_analysis.lane_rows import LANES, rows_needed, rows_of, tuples_in
+from agv_analysis.compiled.functions import compiled_over_lanes
+from agv_analysis.compiled.lane_rows import LANES, rows_needed, rows_of, tuples_in
 from agv_analysis.metrics.bands import FORGOTTEN_STEPS
 from agv_analysis.metrics.order_statistics import P99, not_exceeded_in_columns
 from agv_analysis.run import Floats

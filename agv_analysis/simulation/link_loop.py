@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.simulation.loop import (
     EdgeOutput,
     EdgeState,

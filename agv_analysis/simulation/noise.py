@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled, numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.run import Floats
 from agv_analysis.simulation.loop import Rows
 from agv_plant.random_stream import DRAWS, normal_pair, uniforms

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.compiled import HAS_NUMBA, compiled
+from agv_analysis.compiled.functions import HAS_NUMBA, compiled
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import recall_memory, store_memory
 from agv_cloud.control.command import control_law

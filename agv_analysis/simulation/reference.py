@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.run import Floats
 from agv_cloud.parameters import ErrorDetectorParameters
 from agv_cloud.reference.reference import Reference, lap_steps

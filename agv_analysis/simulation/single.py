@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.run import Floats, Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.link_loop import history_over_links

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.metrics.outages import Outcomes, Steps, ages
 from agv_analysis.run import Floats, Run
 from agv_analysis.simulation.link_loop import empty_trace, history_over_links, link_that_holds

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.link.markov_channel import Chain, bernoulli
 from agv_analysis.run import Floats
 from agv_analysis.stability.first_border import borders, crossing

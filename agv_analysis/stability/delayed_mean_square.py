@@ -25,7 +25,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.link.age_chain import AgeChain
 from agv_analysis.run import Floats
 from agv_analysis.stability import floquet

@@ -27,7 +27,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.link.joint_chain import OUTCOMES, JointChain
 from agv_analysis.link.markov_channel import cycle_of
 from agv_analysis.run import Floats

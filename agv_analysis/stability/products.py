@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.run import Floats
 from agv_ros.substitution import Replacements
 

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import numbers
+from agv_analysis.compiled.functions import numbers
 from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.metrics.outages import ages
 from agv_analysis.run import Floats, Run

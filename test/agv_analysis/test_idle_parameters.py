@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis import compiled
+from agv_analysis.compiled import functions as compiled
 from agv_analysis.idle_parameters import idle_parameters
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import parts

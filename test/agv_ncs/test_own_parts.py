@@ -119,7 +119,7 @@ import agv_ncs
 def law(x_e, y_e, theta_e, v_r, w_r):
     return FACTOR * v_r, w_r
 agv_ncs.register_control_law("mine", law)
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_cloud.control.command import command, control_law
 from agv_cloud.control.registry import CONTROL_LAWS
 fast = compiled(command, {control_law: CONTROL_LAWS.find("mine").adapter})

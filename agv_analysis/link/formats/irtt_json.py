@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agv_analysis.compiled import HAS_NUMBA
+from agv_analysis.compiled.functions import HAS_NUMBA
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.irtt_shapes import Shapes, Trip
 from agv_analysis.link.formats.text_columns import Progress, chunks

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.simulation.loop import RunInputs, at_rest, history, statistics, statistics_of_two
@@ -96,7 +96,7 @@ CALL = """
 import sys
 sys.path.insert(0, sys.argv[1])
 import outer
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 print(compiled(outer.outer)(2.0))
 """
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agv_analysis import compiled
-from agv_analysis.lane_rows import LANES
+from agv_analysis.compiled import functions as compiled
+from agv_analysis.compiled.lane_rows import LANES
 from agv_analysis.metrics.order_statistics import not_exceeded, not_exceeded_in_columns
 from agv_analysis.scenario import Scenario, load_scenario
 from agv_analysis.simulation import batch, simulate, simulate_batch

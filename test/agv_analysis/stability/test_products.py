@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from agv_analysis.compiled import compiled
+from agv_analysis.compiled.functions import compiled
 from agv_analysis.run import Floats
 from agv_analysis.stability.products import assign, divide, largest_entry
 

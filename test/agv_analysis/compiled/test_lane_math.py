@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from agv_analysis.lane_math import LARGEST_ANGLE, cosine, sine
+from agv_analysis.compiled.lane_math import LARGEST_ANGLE, cosine, sine
 
 TURNS = np.arange(-4_000, 4_001) * (math.pi / 2)
 

@@ -29,13 +29,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agv_analysis.lane_math import cosine, sine
+from agv_analysis.compiled.lane_math import cosine, sine
 from agv_ros.substitution import Function, Replacements, calls_of, functions_in, named_by, plain, replaced, with_globals
 
 HAS_NUMBA = importlib.util.find_spec("numba") is not None
 """Is numba installed? Without it, everything runs as plain Python."""
 
-_LOCATOR = "agv_analysis.compiled_cache.ContentLocator"
+_LOCATOR = "agv_analysis.compiled.cache.ContentLocator"
 
 LOG = logging.getLogger(__name__)
 """Says which function is about to be compiled, because it is not on disk."""
@@ -67,7 +67,7 @@ def compiled_over_lanes(function: Function, constants: tuple[tuple[str, Any], ..
 
 @functools.cache
 def _compiled_over_lanes(function: Function, constants: tuple[tuple[str, Any], ...]) -> Callable[..., Any]:
-    from agv_analysis.lane_memory import load_lane, store_lane
+    from agv_analysis.compiled.lane_memory import load_lane, store_lane
 
     named = with_globals(function, {**dict(constants), "load_lane": load_lane, "store_lane": store_lane})
     return _compile(named, _cache_folder(named, {}, _LANE_SOURCES), {}, _over_lanes())

@@ -17,7 +17,7 @@ from numba.core.types import Boolean, none, void
 from numba.core.types.containers import BaseTuple
 from numba.extending import intrinsic
 
-from agv_analysis.lane_rows import LANES
+from agv_analysis.compiled.lane_rows import LANES
 
 _WORD = ir.IntType(64)
 
