@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -159,21 +160,16 @@ def _write_reports(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None
 
 def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
 
     from agv_analysis.report.table import metres
     from agv_analysis.sweep.verdicts import counted
 
-    table = Table(box=None, pad_edge=False)
-    for axis in sweep.axes:
-        table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
-    for name in ("runs", "unstable", "probability", "95 % confidence", "to 1 cm [steps]", "deviation"):
-        table.add_column(escape(name), justify="right", no_wrap="%" in name)
+    names = ("unstable\nruns", "share of\nthem", "95 %\nconfidence", "steps to\n1 cm", "largest\ndeviation")
+    table = _table(sweep, names)
     for row in rows:
         table.add_row(
             *(_plain(row[axis.name]) for axis in sweep.axes),
-            str(row["runs"]), str(row["unstable"]), "-" if row["undecided"] else f"{row['instability']:.3f}",
+            f"{row['unstable']} of {row['runs']}", "-" if row["undecided"] else f"{row['instability']:.3f}",
             f"{row['instability_low']:.3f} .. {row['instability_high']:.3f}", f"{row['settle_1cm_steps_p50']:g}",
             metres(row["deviation_max_p50"]),
         )  # fmt: skip
@@ -192,17 +188,29 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
         )
 
 
-def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
-    """What each point does within its corridor, the best one marked."""
+_IN_A_LAP = "leaves in\na lap"
+"""The widest column, with an interval, which may take two lines."""
+
+
+def _table(sweep: Sweep, names: Sequence[str] = ()) -> Table:
+    """A table that begins with a column for each axis, as narrow as its name allows."""
     from rich.table import Table
 
+    table = Table(box=None, pad_edge=False)
+    for axis in sweep.axes:
+        name = axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name
+        table.add_column(name, justify="right", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=name != _IN_A_LAP)
+    return table
+
+
+def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
+    """What each point does within its corridor, the best one marked."""
     from agv_analysis.sweep.corridors import best_for_corridor
 
-    table, best = Table(box=None, pad_edge=False), best_for_corridor(sweep, rows)
-    for axis in sweep.axes:
-        table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
-    for name in ("single\noutage", "any\noutages", "leaves in a lap", "leaves in an hour", "mean time [s]", ""):
-        table.add_column(name, justify="right")
+    best = best_for_corridor(sweep, rows)
+    table = _table(sweep, ("single\noutage", "any\noutages", _IN_A_LAP, "in an\nhour", "mean\ntime [s]", ""))
     for row in rows:
         table.add_row(
             *(_plain(row[axis.name]) for axis in sweep.axes), f"{row['n_single']:g}", f"{row['n_any']:g}",
@@ -215,14 +223,11 @@ def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
 def _verdicts(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
     """The word on each point, and why."""
     from rich.markup import escape
-    from rich.table import Table
 
     from agv_analysis.report.table import colour_of
 
-    table = Table(box=None, pad_edge=False)
-    for axis in sweep.axes:
-        table.add_column(axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name, justify="right")
-    table.add_column("verdict")
+    table = _table(sweep)
+    table.add_column("verdict", no_wrap=True)
     table.add_column("because")
     for row in rows:
         word = row["verdict"]
