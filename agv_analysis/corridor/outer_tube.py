@@ -13,7 +13,8 @@ support function V_k(d) = sup d' z(k), over all sequences, obeys
 
 It is bounded from above on a few directions d: both along x_e, and a polygon in the plane of y_e and theta_e. Any
 other direction is a sum of three of them with positive weights, and V of a sum is at most the sum. Bounds of a lap that
-are no larger at its end than at its beginning hold forever.
+are no larger at its end than at its beginning hold forever; so do those of its halves, computed side by side, if each
+half ends with bounds that are no larger than those with which the other one begins.
 
 This proves the tube for the linear loop with the b_i of the nonlinear one. What is of second order, the `remainder`,
 can be added to each b_i as a box. Its size is measured on the nonlinear loop, from the corners of the very tube, at
@@ -25,6 +26,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -225,23 +227,34 @@ def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Fl
     lap = -(-max(rows, n + 2, _WARM_UP) // whole) * whole  # in whole turns of the rows, longer than any memory
     widths = loop.widths
     limit = _FARTHER * min(widths.distance, max(widths.along, widths.across))
-    window = np.zeros((n + 2, len(template.directions)))
     bounds = np.empty((lap, len(template.directions)))
+    begins = (0, lap // 2 // apart * apart) if lap >= 2 * max(warm_up, n + 2) else (0,)
+    parts = tuple(zip(begins, np.split(bounds, begins[1:]), strict=True))
     drive = compiled(_push, of_size_3(linear.F, linear.G))
     matrices = linear.F, linear.G, linear.H, linear.K
     arguments = *matrices, bias.rows, bias.every, rows, remainder, template.directions, template.lever, apart
-    begun = np.empty((warm_up, len(template.directions)))
-    if not drive(*arguments, -warm_up % rows, window, begun, limit):
-        return None
-    for _ in range(_LAPS):
-        window += _SLACK * np.where(np.isfinite(window), np.abs(window) + 1e-6, 0.0)
-        before = window.copy()
-        if not drive(*arguments, 0, window, bounds, limit):
-            return None
-        if (window <= before).all():
-            of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)[::apart]
-            nominal = bias.nominal[::apart]
-            return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
+
+    def warmed_up(begin: int, _: Floats) -> Floats | None:
+        window = np.zeros((n + 2, len(template.directions)))
+        begun = np.empty((warm_up, len(template.directions)))
+        return window if drive(*arguments, (begin - warm_up) % rows, window, begun, limit) else None
+
+    def driven(begin: int, of_part: Floats, window: Floats) -> Floats | None:
+        return window if drive(*arguments, begin % rows, window, of_part, limit) else None
+
+    with ThreadPoolExecutor(len(parts)) as pool:
+        windows = [*pool.map(warmed_up, *zip(*parts, strict=True))]
+        for _ in range(_LAPS):
+            if any(window is None for window in windows):
+                return None
+            known = [window for window in windows if window is not None]
+            before = [window + _SLACK * np.where(np.isfinite(window), np.abs(window) + 1e-6, 0.0) for window in known]
+            ends = [*pool.map(driven, *zip(*parts, strict=True), [window.copy() for window in before])]
+            windows = [ends[-1], *ends[:-1]]  # each part goes on where the one before it has ended
+            if all(end is not None and (end <= begin).all() for end, begin in zip(windows, before, strict=True)):
+                of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)[::apart]
+                nominal = bias.nominal[::apart]
+                return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
     return None
 
 
