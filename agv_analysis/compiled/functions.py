@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agv_analysis.compiled.folder_lock import one_process_at_a_time
 from agv_analysis.compiled.lane_math import cosine, sine
 from agv_ros.substitution import Function, Replacements, calls_of, functions_in, named_by, plain, replaced, with_globals
 
@@ -126,11 +127,20 @@ def _compile(
     try:
         for name in usual:
             setattr(numba.config, name, wanted[name])
-        dispatcher: Callable[..., Any] = numba.njit(nogil=True, cache=folder is not None, **way.options)(copy)
+        dispatcher: Any = numba.njit(nogil=True, cache=folder is not None, **way.options)(copy)
     finally:
         for name, value in usual.items():
             setattr(numba.config, name, value)
-    return dispatcher
+    if folder is not None:
+        dispatcher.compile = functools.partial(_compile_or_wait, dispatcher.compile, folder)
+    found: Callable[..., Any] = dispatcher
+    return found
+
+
+def _compile_or_wait(compile_it: Callable[..., Any], folder: Path, *signature: Any) -> Any:
+    """Compile for a signature, or wait while another process does so and load what it has kept."""
+    with one_process_at_a_time(folder):
+        return compile_it(*signature)
 
 
 def _compiled_calls(

@@ -180,3 +180,34 @@ def test_where_nothing_can_be_kept_it_is_compiled_each_time(tmp_path: Path) -> N
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "outer.py").write_text("def outer(x):\n    return 3.0 * x\n")
     assert in_another_process(CALL, tmp_path / "file" / "cache", str(tmp_path)) == "6.0\n"
+
+
+def test_of_several_processes_one_compiles_and_the_others_load(tmp_path: Path) -> None:
+    """All wait for a line before they call a function for the first time; numba counts what its cache had."""
+    pytest.importorskip("numba")
+    code = (
+        "import sys, numpy as np\n"
+        "from agv_analysis.compiled.functions import compiled\n"
+        "from agv_analysis.stability.products import multiply\n"
+        "one = np.eye(3)\n"
+        "print('ready', flush=True)\n"
+        "sys.stdin.readline()\n"
+        "function = compiled(multiply)\n"
+        "function(one, one, False, one.copy(), False)\n"
+        "print(sum(function.stats.cache_hits.values()), sum(function.stats.cache_misses.values()))\n"
+    )
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "env": environment}
+    processes = [subprocess.Popen([sys.executable, "-c", code], **pipes) for _ in range(3)]  # type: ignore[call-overload]
+    try:
+        for process in processes:
+            assert process.stdout.readline() == "ready\n"
+        for process in processes:
+            process.stdin.write("go\n")
+            process.stdin.flush()
+        said = sorted(process.communicate()[0] for process in processes)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert said == ["0 1\n", "1 0\n", "1 0\n"]
