@@ -250,7 +250,7 @@ def test_simulated_twins_on_both_sides(p: float, settings: list[str], contracts:
     ])  # fmt: skip
     growth = margins(wanted)["late_poses.mean_square_growth"]
     assert (growth < 0.0) == contracts
-    square = np.mean(simulate_batch([wanted], range(1, 61), twins=True)["contraction"] ** 2)
+    square = np.mean(simulate_batch([wanted], range(1, 31), twins=True)["contraction"] ** 2)
     assert (square < 1e-3) if contracts else (square > 1e3)
 
 
