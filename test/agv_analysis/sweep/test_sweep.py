@@ -350,8 +350,9 @@ def test_the_table_names_its_units_and_fits_80_columns(monkeypatch: pytest.Monke
     monkeypatch.setenv("COLUMNS", "80")
     options = ["--set", "plant.duration=1.0", "--vary", "controller.kx=5,25", "--seeds", "2", "--no-verdicts"]
     said = CliRunner().invoke(main, ["sweep", PAPER, *options]).output
-    assert "[steps]" in said
-    assert re.search(r"^ +25 +2 +\d +\S+ +[\d.]+ \.\. [\d.]+ +47 +0\.00\d+ m$", said, re.MULTILINE), said
+    assert "…" not in said
+    assert re.search(r"kx +runs +them +confidence +1 cm +deviation$", said, re.MULTILINE), said
+    assert re.search(r"^ +25 +\d of 2 +\S+ +[\d.]+ \.\. [\d.]+ +47 +0\.00\d+ m$", said, re.MULTILINE), said
 
 
 def test_a_cluster_that_is_not_there_is_named() -> None:
