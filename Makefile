@@ -7,7 +7,7 @@ DEMO := bags/demo
 PROSE := README.md CONTRIBUTING.md SECURITY.md QUALITY_DECLARATION.md CHANGELOG.md $(filter-out docs/style.md,$(wildcard docs/*.md))
 
 # Many tests wait, for processes to start and for DDS, so cores have time for more of them.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print(max(1, 3 * len(os.sched_getaffinity(0)) // 2))')
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print(2 * len(os.sched_getaffinity(0)))')
 
 HAVE_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo yes)
 comma := ,

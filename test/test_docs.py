@@ -57,11 +57,6 @@ def test_a_page_has_a_row_for_every_part_with_its_parameters(page: str, registry
             )
 
 
-@pytest.mark.no_cover
-def test_the_page_of_policies_is_current(update: Any) -> None:
-    assert update.policies_page() == (REPOSITORY / "docs/policies.md").read_text()
-
-
 def test_the_readme_shows_what_the_demo_prints(update: Any, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     bag = str(tmp_path / "bag")

@@ -430,6 +430,13 @@ def test_the_page_is_current(made: Made) -> None:
     assert made.page == (REPOSITORY / "docs/paper.md").read_text(encoding="utf-8")
 
 
+def test_the_page_of_policies_has_the_ranking_that_the_command_makes(made: Made) -> None:
+    page = (REPOSITORY / "docs/policies.md").read_text(encoding="utf-8")
+    ranking = page.partition("<!-- ranking:begin -->\n")[2].partition("<!-- ranking:end -->")[0]
+    assert ranking.count("###") == 2
+    assert ranking in (made.folder / "future.md").read_text(encoding="utf-8")
+
+
 def test_the_command_writes_everything(made: Made) -> None:
     assert {claim["key"]: claim["verdict"] for claim in made.content["claims"]} == EXPECTED
     assert made.content["source"] == "simulation"

@@ -22,7 +22,7 @@ TS, LAP = 0.02, 5000
 J01 = 2.404825557695773
 """First zero of the Bessel function J0: a figure of eight closes with it."""
 
-LOOPS, SECONDS = 16, 600.0
+LOOPS, SECONDS = 12, 600.0
 Loop = dict[str, Any]
 
 

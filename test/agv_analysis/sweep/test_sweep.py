@@ -328,7 +328,7 @@ def test_workers_and_interruptions_change_nothing(tmp_path: Path) -> None:
 
 def test_a_cluster_gives_the_same_numbers_and_survives_the_loss_of_a_worker() -> None:
     distributed = pytest.importorskip("distributed")
-    sweep = sweep_of("controller.kx=5:400:30", "relay.uplink.p=0.1:0.9:10", seeds=12)
+    sweep = sweep_of("controller.kx=5:400:15", "relay.uplink.p=0.1:0.9:10", seeds=12)
     expected = rows_of(sweep)
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
