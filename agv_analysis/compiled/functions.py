@@ -111,6 +111,9 @@ class _Way(NamedTuple):
 
 _PLAINLY = _Way({}, {})
 
+_INLINED: dict[tuple[tuple[tuple[Function, Function], ...], int], dict[Function, Any]] = {}
+"""What has been compiled to be put inside callers, by replacements and way: for all functions that call it."""
+
 
 def _compile(
     function: Function, folder: Path | None, replacements: Replacements, way: _Way = _PLAINLY
@@ -120,7 +123,8 @@ def _compile(
 
     if folder is not None and not any(folder.glob("*.nbi")):  # numba's index of what is there
         LOG.info("%s is compiled, and kept in %s", function.__qualname__, folder)
-    copy = with_globals(function, _compiled_calls(function, replacements, {}, way))
+    made = _INLINED.setdefault((tuple(replacements.items()), id(way)), {})
+    copy = with_globals(function, _compiled_calls(function, replacements, made, way))
     # Looked at by the decorator, not later. An older numba has no such locators, and compiles for each place anew.
     wanted = {"CACHE_DIR": str(folder or ""), "CACHE_LOCATOR_CLASSES": _LOCATOR}
     usual = {name: getattr(numba.config, name) for name in wanted if hasattr(numba.config, name)}
