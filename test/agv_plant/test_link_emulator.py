@@ -79,11 +79,17 @@ class Radio:
         return publisher
 
     def received(self, kind: type, topic: str, qos: QoSProfile, on: Node | None = None) -> list[bytes]:
-        """What comes, serialised; once the emulator publishes it."""
+        """What comes, serialised; once the emulator publishes it to this subscription."""
         found: list[bytes] = []
         where = on or self.edge
         where.create_subscription(kind, topic, found.append, qos, raw=True)
-        self.until(lambda: bool(where.count_publishers(topic)))
+        name = where.resolve_topic_name(topic)
+
+        def is_connected() -> bool:
+            publishers = [one for node in (self.emulator, *self.emulator.sides) for one in node.publishers]
+            return any(one.topic_name == name and one.get_subscription_count() for one in publishers)
+
+        self.until(is_connected)
         return found
 
     def close(self) -> None:

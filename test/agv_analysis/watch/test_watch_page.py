@@ -198,7 +198,10 @@ def test_the_strip_is_what_the_bag_holds(watched: Watched) -> None:
     np.testing.assert_allclose(points[:, 3], distance[steps].max(axis=1), rtol=0.0, atol=1e-4)
     np.testing.assert_array_equal(points[:, 6], run.lost[steps].sum(axis=1))
     np.testing.assert_allclose(points[:, 5], 0.005 * run.n_ul[steps].max(axis=1), atol=1e-4)
-    np.testing.assert_allclose(points[:, 4], run.command[steps[:, -1], 0], rtol=0.0, atol=1e-4)
+    # Of a loop that begins late, commands may come after the point that would have shown them.
+    is_known = ~np.isnan(points[:, 4])
+    assert is_known.sum() >= len(points) / 2
+    np.testing.assert_allclose(points[is_known, 4], run.command[steps[is_known, -1], 0], rtol=0.0, atol=1e-4)
 
 
 def test_the_next_20_are_lost_and_the_bag_says_why(watched: Watched) -> None:
