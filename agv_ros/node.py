@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    ParameterUninitializedException,
-)
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
@@ -28,8 +22,10 @@ from agv_ros.codec import encode_diagnostics
 from agv_ros.endpoints import Output
 from agv_ros.errors import UserError
 from agv_ros.messages import CHANGED, PUBLISHED
-from agv_ros.parameters import LoopParameters, Parameter, ParameterError, as_dict, build, parameters_of
+from agv_ros.node_parameters import declare
+from agv_ros.parameters import LoopParameters, ParameterError, as_dict, build, parameters_of
 from agv_ros.qos import Input, create_publisher
+from agv_ros.settling import Settling
 from agv_ros.stamps import LATEST_NS, Grid
 from agv_ros.stopping import STOPPED_BY
 
@@ -50,22 +46,8 @@ _OFFERS_PERIOD = 0.25
 _ACK_PERIOD = 0.1
 """For how long [s] at a time a node waits until its subscribers have acknowledged what it has sent."""
 
-_QUIET = 0.02
-"""A node that is stopped has taken what was under way to it when nothing more has come for so long [s]."""
-
 ENDED = "ended"
 """Key in a node's last diagnostics: its counts of messages there are final."""
-
-
-class _Settling(NamedTuple):
-    """A node that is stopped, and takes what is under way to it."""
-
-    received: int
-    """Messages so far."""
-    since: float
-    """When the last one was noticed, by the steady clock [s]."""
-    give_up: float
-    """When others are waited for no longer [s]."""
 
 
 class LoopNode(Node, Generic[P]):
@@ -77,7 +59,7 @@ class LoopNode(Node, Generic[P]):
 
     def __init__(self, name: str, schema: type[P], **node_options: Any) -> None:
         super().__init__(name, **node_options)
-        self.settings: P = _declare(self, schema)
+        self.settings: P = declare(self, schema)
         self.grid = Grid.of(self.settings.start_time, self.settings.ts)
         self.rejected: Counter[str] = Counter()
         """Messages by topic that must not enter the loop."""
@@ -85,7 +67,7 @@ class LoopNode(Node, Generic[P]):
         """Errors of other callbacks by their kind."""
         self.received: Counter[str] = Counter()
         """Messages that have come, by full name of the topic."""
-        self._settling = _Settling(-1, 0.0, math.inf)
+        self._settling = Settling()
         self.finished = False
         self.failure = ""
         self.outputs: list[Output] = []
@@ -231,11 +213,7 @@ class LoopNode(Node, Generic[P]):
 
         Where its peers go on, there is always more: after half of `stop_timeout` it has.
         """
-        now, count, before = time.monotonic(), self.received.total(), self._settling
-        if count != before.received:
-            give_up = min(before.give_up, now + self.settings.stop_timeout / 2.0)
-            self._settling = _Settling(count, now, give_up)
-        return now - self._settling.since > _QUIET or now > self._settling.give_up
+        return self._settling.is_over(self.received.total(), self.settings.stop_timeout / 2.0)
 
     def close(self) -> None:
         """Report for the last time what was published. From then on the node acts on nothing that comes or is due."""
@@ -376,57 +354,3 @@ class LoopNode(Node, Generic[P]):
 def _said(error: Exception) -> str:
     """An error in a line; of one that is not about a value with its kind."""
     return str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-
-
-def _declare(node: Node, schema: type[P]) -> P:
-    """Declare a schema's parameters and read their values. Raises ParameterError."""
-    values = {}
-    for name, parameter in parameters_of(schema).items():
-        default = list(parameter.default) if parameter.kind.endswith("_array") else parameter.default
-        try:
-            values[name] = node.declare_parameter(name, default, _descriptor(parameter)).value
-        except InvalidParameterTypeException as error:
-            found: Any = getattr(error, "parameter", None)
-            value = found.value if isinstance(found, RosParameter) else _override(node, name)
-            parameter.check(node.get_name(), value)
-            raise ParameterError(f"{node.get_name()}.{name} is a {parameter.kind}: {error}") from None
-        except (InvalidParameterValueException, ParameterUninitializedException):
-            parameter.check(node.get_name(), _override(node, name))
-            raise ParameterError(f"{node.get_name()}.{name} must be {parameter.allowed}") from None
-    return build(schema, {name: _plain(value) for name, value in values.items()}, node.get_name())
-
-
-def _override(node: Node, name: str) -> Any:
-    """The value that was asked for from outside (rclpy has no public name for it)."""
-    override = node._parameter_overrides.get(name)
-    return None if override is None else override.value
-
-
-def _plain(value: Any) -> Any:
-    """Array parameters arrive as array.array."""
-    return tuple(value) if hasattr(value, "tolist") or isinstance(value, list) else value
-
-
-def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    unit = f" [{parameter.unit}]" if parameter.unit else ""
-    descriptor = ParameterDescriptor(
-        description=parameter.description + unit,
-        additional_constraints=f"must be {parameter.allowed}" if parameter.kind != "bool" else "",
-        read_only=not parameter.runtime,
-    )
-    low = parameter.low if parameter.low is not None else parameter.above
-    if low is not None and parameter.high is not None:
-        if parameter.kind == "integer":
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(parameter.high), step=0)]
-        elif parameter.kind == "double" and not math.isinf(low):
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=parameter.high, step=0.0)]
-    return descriptor
-
-
-def overrides(settings: object) -> list[RosParameter[Any]]:
-    """rclpy parameter overrides that give a node exactly these settings."""
-    assert dataclasses.is_dataclass(settings)
-    return [
-        RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
-        for name, value in as_dict(settings).items()
-    ]
