@@ -22,7 +22,7 @@ from agv_ros.codec import encode_diagnostics
 from agv_ros.endpoints import Output
 from agv_ros.errors import UserError
 from agv_ros.messages import CHANGED, PUBLISHED
-from agv_ros.node_parameters import declare
+from agv_ros.parameter_declaration import declare
 from agv_ros.parameters import LoopParameters, ParameterError, as_dict, build, parameters_of
 from agv_ros.qos import Input, create_publisher
 from agv_ros.settling import Settling

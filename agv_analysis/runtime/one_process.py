@@ -14,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.runtime.recorder_node import RecorderNode
 from agv_ros.node import LoopNode
-from agv_ros.node_parameters import overrides
+from agv_ros.parameter_declaration import overrides
 
 N = TypeVar("N", bound=LoopNode[Any])
 R = TypeVar("R", bound=RecorderNode)
