@@ -21,7 +21,8 @@ ROS = re.compile(r"rclpy|.*_msgs|.*_interfaces|(rosidl|ament|rmw|rosbag2|tf2|lau
 """Packages that there are on a machine with ROS only."""
 
 SPEAK_ROS = {
-    "agv_ros.node", "agv_ros.parameter_declaration", "agv_ros.endpoints", "agv_ros.qos", "agv_ros.executor", "agv_ros.clock_mode",
+    "agv_ros.node", "agv_ros.parameter_declaration", "agv_ros.endpoints", "agv_ros.qos", "agv_ros.executor",
+    "agv_ros.clock_mode",
     "agv_analysis.runtime.middleware", "agv_analysis.runtime.one_process", "agv_analysis.runtime.runner",
     "agv_analysis.runtime.processes",
 }  # fmt: skip
