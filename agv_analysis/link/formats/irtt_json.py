@@ -2,9 +2,9 @@
 
 Each member of `round_trips` has a number, what became of it (`lost`: false, true, true_up, true_down, as a string or as
 a boolean), time stamps and delays in nanoseconds. true_up was lost on the way there, so nothing came that could be lost
-on the way back; true: irtt does not know on which way. Without the word a packet was received if it has a round-trip
-time. Read some members at a time, so that a file may be of any size; by msgspec, where it is installed, at four times
-the speed. Source: irtt-client(1), JSON format.
+on the way back; true: irtt does not know on which way. Without the word, or with null, a packet was received if it has
+a round-trip time. Read some members at a time, so that a file may be of any size; by msgspec, where it is installed, at
+four times the speed. Source: irtt-client(1), JSON format.
 """
 
 from __future__ import annotations
@@ -48,6 +48,8 @@ from agv_analysis.link.packet_grid import count_on
 from agv_analysis.run import Floats
 
 _BEGIN = re.compile(rb'"round_trips"\s*:\s*\[')
+_TEXT = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\\?\Z)', re.DOTALL)
+"""A string of JSON, which may be cut."""
 _INTERVAL = re.compile(rb'"interval"\s*:\s*(\d+)')
 _NS = 1e-9
 _BATCH, _LARGE_BATCH = 1 << 16, 1 << 18
@@ -65,7 +67,7 @@ _WAYS = {
 }
 """Outcomes of the uplink, of the downlink and of the whole by irtt's word; the last: it says nothing."""
 
-_WORDS = {word: code for code, word in enumerate(_WAYS)} | {False: 0, True: 1}
+_WORDS = {word: code for code, word in enumerate(_WAYS)} | {False: 0, True: 1, None: 4}
 
 
 def _matches(head: bytes, path: Path) -> bool:
@@ -166,8 +168,10 @@ def _batches(
 
 
 def _end(text: bytes) -> int | None:
-    """Where the list of members ends: at the first closing bracket that closes none of their own."""
-    at = -1
+    """Where the list of members ends: at the first closing bracket that closes none of theirs. Strings do not count."""
+    if b"]" not in text:
+        return None
+    text, at = _TEXT.sub(lambda found: b" " * len(found[0]), text), -1
     while (at := text.find(b"]", at + 1)) >= 0:
         if text.count(b"[", 0, at) == text.count(b"]", 0, at):
             return at
@@ -212,7 +216,7 @@ def _trip(member: Any) -> Trip | None:
         return None
     word = member.get("lost", "")
     word = word.lower() if isinstance(word, str) else word
-    if not isinstance(word, (str, bool)) or word not in _WORDS:
+    if not isinstance(word, (str, bool, type(None))) or word not in _WORDS:
         return None
     delay = _part(member, "delay")
     sent = _part(member, "timestamps", "client", "send")
@@ -253,7 +257,7 @@ def _decoder() -> Callable[[bytes], list[Trip] | None]:
     client = msgspec.defstruct("Client", [("send", stamps, msgspec.field(default_factory=stamps))])
     both = msgspec.defstruct("Both", [("client", client, msgspec.field(default_factory=client))])
     trip: Any = msgspec.defstruct("Trip", [
-        ("seqno", int), ("lost", str | bool, ""), ("delay", delay, msgspec.field(default_factory=delay)),
+        ("seqno", int), ("lost", str | bool | None, ""), ("delay", delay, msgspec.field(default_factory=delay)),
         ("timestamps", both, msgspec.field(default_factory=both)),
     ])  # fmt: skip
     decoder = msgspec.json.Decoder(list[trip])

@@ -28,7 +28,7 @@ from agv_analysis.link.packet_grid import PacketGrid
 from agv_analysis.run import Floats
 
 _LINE = re.compile(rb"^seq=\d+ rtt=-?[\d.]+", re.MULTILINE)
-_OTHER = re.compile(rb"\[\w+\] .*|DUP! seq=\d+|\s.*|.*(stats|rate|loss|duration|pkts|sent/received|Min|---|RTT).*")
+_OTHER = re.compile(rb"\[.*\] .*|DUP! seq=\d+|\s.*|.*(stats|rate|loss|duration|pkts|sent/received|Min|---|RTT).*")
 """Lines that say nothing of a reply: events, duplicates, and the table at the end, which is set to the right."""
 
 _USUAL_INTERVAL = 1.0

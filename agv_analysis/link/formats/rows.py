@@ -8,7 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.link.formats.text_columns import Block, Bytes, Places, Progress, blocks, cells, numbers_at
+from agv_analysis.link.formats.text_columns import (
+    Block,
+    Bytes,
+    Numbers,
+    Places,
+    Progress,
+    blocks,
+    cells,
+    numbers_at,
+)
 from agv_analysis.link.measurement import Malformed
 from agv_analysis.run import Floats
 
@@ -35,7 +44,10 @@ def words_of(block: Block, count: int) -> Words:
     return Words(np.flatnonzero(is_whole), begins[kept].reshape(-1, count), ends[kept].reshape(-1, count))
 
 
-_NOTHING = (b"", b"nan", b"na", b"n/a", b"null", b"none", b"-", b"*", b"lost", b"timeout")
+_MOST_DIGITS = 19
+"""Digits that an unsigned integer of 64 bits holds, whatever they are."""
+
+_NOTHING = (b"", b"nan", b"na", b"n/a", b"null", b"none", b"-", b".", b"*", b"lost", b"timeout")
 """What stands for a number that is not there."""
 
 
@@ -48,10 +60,17 @@ def floats_at(
     """
     negative = text[np.minimum(begins, len(text) - 1)] == ord("-")
     numbers = numbers_at(text, begins + negative, commas)
-    plain = (numbers.length == ends - begins - negative) & (numbers.length > 0)
-    values = np.where(negative, -numbers.values, numbers.values)
-    good = plain.copy()
-    others = np.flatnonzero(~plain)
+    is_sound = numbers.length - (numbers.decimals > 0) <= _MOST_DIGITS
+    is_sound &= (numbers.digits > 0) | (text.take(begins + negative, mode="clip") == ord("0"))  # a point alone is none
+    values, good = numbers.values, is_sound & (numbers.length == ends - begins - negative)
+    others = np.flatnonzero(~good)
+    if len(others):
+        rows = others[is_sound[others] & (numbers.length[others] > 0)]
+        scaled, fine = _scaled(text, (begins + negative)[rows], ends[rows], numbers.taken(rows))
+        values[rows[fine]], good[rows[fine]] = scaled[fine], True
+        others = np.flatnonzero(~good)
+    if negative.any():
+        values[negative] *= -1.0
     if len(others):
         words = cells(text, begins[others], ends[others])
         empty = np.isin(np.char.lower(words), _NOTHING)
@@ -62,6 +81,23 @@ def floats_at(
             except ValueError:
                 values[i] = np.nan
     return values, good
+
+
+def _scaled(
+    text: Bytes, begins: Places, ends: Places, numbers: Numbers
+) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
+    """Numbers behind which a power of ten stands, as in 2.5e-03, shape (n,), and which are so."""
+    at = begins + numbers.length
+    sign = text.take(at + 1, mode="clip")
+    is_minus = sign == ord("-")
+    first = at + 1 + (is_minus | (sign == ord("+")))
+    power = numbers_at(text, first)
+    good = (text.take(at, mode="clip") | 32 == ord("e")) & (power.length > 0) & (power.length <= 2)
+    good &= (first + power.length == ends) & (text.take(ends - 1, mode="clip") != ord("."))
+    shift = np.where(is_minus, -power.integers, power.integers) - numbers.decimals
+    scale = 10.0 ** np.abs(np.where(good, shift, 0))
+    digits = numbers.digits.astype(np.float64)
+    return np.where(shift < 0, digits / scale, digits * scale), good
 
 
 def lines_of_words(

@@ -31,6 +31,8 @@ _GZIP = b"\x1f\x8b"
 _DIGITS = 24
 """Most characters of a number."""
 
+_POWERS = 10.0 ** np.arange(_DIGITS + 1)
+
 _POINT, _COMMA = (np.uint8((ord(mark) - ord("0")) % 256) for mark in ".,")
 """Decimal marks, counted from the digit 0 on."""
 
@@ -135,36 +137,52 @@ class Numbers(NamedTuple):
     @property
     def values(self) -> Floats:
         """As floats, NaN where there is no number: exact up to 15 digits."""
-        found = self.digits.astype(np.float64) / 10.0 ** self.decimals.astype(np.float64)
-        return np.where(self.length > 0, found, np.nan)
+        found = self.digits.astype(np.float64)
+        found /= _POWERS[self.decimals]
+        found[self.length == 0] = np.nan
+        return found
 
     @property
     def integers(self) -> NDArray[np.int64]:
         """As whole numbers."""
         return self.digits.astype(np.int64)
 
+    def taken(self, rows: Places) -> Numbers:
+        """Some of them."""
+        return Numbers(self.digits[rows], self.decimals[rows], self.length[rows])
+
 
 def numbers_at(text: Bytes, places: Places, commas: bool = False) -> Numbers:
     """The unsigned decimal numbers that begin at these places, shape (n,); `commas`: a comma is a decimal mark, too."""
-    count, last = len(places), len(text) - 1
+    count = len(places)
     digits = np.zeros(count, dtype=np.uint64)
-    decimals, length = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    goes_on, has_point = np.ones(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    point, length = np.full(count, -1), np.full(count, _DIGITS)
+    rows, at, value, marked = np.arange(count), places.copy(), digits.copy(), point.copy()  # of those that go on
     for i in range(_DIGITS):
-        letter = text[np.minimum(places + i, last)] - np.uint8(ord("0"))  # others wrap around
-        is_digit = goes_on & (letter < 10)
+        letter = text.take(at, mode="clip") - np.uint8(ord("0"))  # others wrap around
+        at += 1
+        is_digit = letter < 10
+        if is_digit.all():
+            value *= np.uint64(10)
+            value += letter
+            continue
         is_point = letter == _POINT
         if commas:
             is_point |= letter == _COMMA
-        is_point &= goes_on & ~has_point
-        digits = np.where(is_digit, digits * np.uint64(10) + letter, digits)
-        decimals += is_digit & has_point
-        has_point |= is_point
+        is_point &= marked < 0
+        marked[is_point] = i
         goes_on = is_digit | is_point
-        length += goes_on
-        if not goes_on.any():
-            break
-    return Numbers(digits, decimals, length)
+        if not goes_on.all():
+            ended = ~goes_on
+            done = rows[ended]
+            digits[done], point[done], length[done] = value[ended], marked[ended], i
+            rows, at, value, marked = rows[goes_on], at[goes_on], value[goes_on], marked[goes_on]
+            if not len(rows):
+                break
+            letter, is_digit = letter[goes_on], is_digit[goes_on]
+        value = np.where(is_digit, value * np.uint64(10) + letter, value)
+    digits[rows], point[rows] = value, marked
+    return Numbers(digits, np.where(point < 0, 0, length - 1 - point), length)
 
 
 def cells(text: Bytes, begins: Places, ends: Places, width: int = 40) -> NDArray[np.bytes_]:

@@ -148,20 +148,32 @@ def test_irtt_with_fields_that_are_missing(tmp_path: Path) -> None:
         {"seqno": 2, "lost": True, "delay": None, "timestamps": None},
         {"seqno": 3, "delay": {"rtt": 6_000_000, "send": None}},
         {"seqno": 4},
-        {"seqno": 5, "lost": "TRUE_DOWN", "delay": {"send": 2_000_000}, "extra": [1, {"a": []}]},
+        {"seqno": 5, "lost": "TRUE_DOWN", "delay": {"send": 2_000_000}, "extra": [1, {"a": []}, '"]}, ["']},
+        {"seqno": 6, "lost": None, "delay": {"rtt": 7_000_000}},
+        {"seqno": 7, "lost": None},
     ]
     found = read(tmp_path / "a", irtt(trips))
     assert found.uplink is not None
     assert found.downlink is not None
-    assert found.whole.outcome.tolist() == [RECEIVED, LOST, LOST, RECEIVED, UNKNOWN, LOST]
-    assert found.uplink.outcome.tolist() == [RECEIVED, LOST, UNKNOWN, RECEIVED, UNKNOWN, RECEIVED]
-    assert found.downlink.outcome.tolist() == [RECEIVED, NOT_SENT, UNKNOWN, RECEIVED, UNKNOWN, LOST]
-    assert found.sent.tolist() == pytest.approx([0.02 * i for i in range(6)])
+    assert found.whole.outcome.tolist() == [RECEIVED, LOST, LOST, RECEIVED, UNKNOWN, LOST, RECEIVED, UNKNOWN]
+    assert found.uplink.outcome.tolist()[:6] == [RECEIVED, LOST, UNKNOWN, RECEIVED, UNKNOWN, RECEIVED]
+    assert found.downlink.outcome.tolist()[:6] == [RECEIVED, NOT_SENT, UNKNOWN, RECEIVED, UNKNOWN, LOST]
+    assert found.sent.tolist() == pytest.approx([0.02 * i for i in range(8)])
+    assert found.malformed.count == 0
     assert found.uplink.delay is not None
     assert found.uplink.delay[5] == pytest.approx(0.002)
-    for sentence in ("of 1 lost packets irtt does not know on which way", "of 1 packets the file does not say",
+    for sentence in ("of 1 lost packets irtt does not know on which way", "of 2 packets the file does not say",
                      "they are dated by their numbers"):  # fmt: skip
         assert sentence in said(found)
+
+
+def test_irtt_text_with_what_it_prints_before_and_between(tmp_path: Path) -> None:
+    found = read(
+        tmp_path / "a",
+        "[Connecting] connecting to 10.0.0.2\n[10.0.0.2:2112] [Connected] connection established\nseq=0 rtt=1.02ms\n"
+        "[[fe80::1]:2112] [WaitForPackets] waiting 1s for final packets\nseq=2 rtt=900µs\nseq 3\n",
+    )
+    assert (lost(found), found.malformed.shown) == ([1], ["line 6: 'seq 3'"])
 
 
 def test_irtt_with_members_that_are_broken_keeps_the_others(tmp_path: Path) -> None:
@@ -274,6 +286,27 @@ def test_tables_of_spreadsheets_and_scripts(tmp_path: Path, text: str) -> None:
     assert delays(found) == pytest.approx([0.0125, NAN, 0.007], nan_ok=True)
     assert found.sent.tolist() == pytest.approx([0.0, 0.02, 0.04], abs=1e-6)
     assert ("commas are taken for decimal marks" in said(found)) == (";" in text.splitlines()[0])
+
+
+def test_numbers_of_a_table_are_those_that_python_reads(tmp_path: Path) -> None:
+    cells = [
+        "2.5e-03",
+        "-1.25E+2",
+        "1e5",
+        "5",
+        ".5",
+        "-0.0625",
+        "0.0312345678901234567890",
+        "9.012345678901234567e-03",
+        "1e-12",
+        "7.e2",
+    ]
+    rows = "".join(f"{cell},0\n" for cell in cells)
+    found = read(tmp_path / "a", "time,lost\n" + rows + "1e5.,0\n1e,0\n.e1,0\n")
+    expected = np.sort([float(cell) for cell in cells])
+    assert found.sent == pytest.approx(expected - expected[0], rel=1e-15)
+    assert found.malformed.count == 3
+    assert delays(read(tmp_path / "b", "time,delay\n0,.\n1,2\n2,-\n")) == pytest.approx([NAN, 2.0, NAN], nan_ok=True)
 
 
 def test_rows_of_a_table_that_are_none_are_named(tmp_path: Path) -> None:
