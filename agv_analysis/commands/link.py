@@ -35,6 +35,7 @@ _LONG = 2**25
     "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between packets [s] where FILE has none."
 )
 @click.option("--column", "columns", multiple=True, metavar="ROLE=NAME", help="Which column of a table is what.")
+@click.option("--delimiter", default="", metavar="CHARACTER", help="Between the cells of a table; or tab, space.")
 @click.option("--topic", default="", help="Which topic of a bag.")
 @click.option("--received", type=click.Path(path_type=Path), help="The capture at the other end, beside FILE.")
 @click.option(
@@ -47,8 +48,8 @@ _LONG = 2**25
 @with_force
 def command(
     file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, name: str | None,
-    interval: float | None, columns: tuple[str, ...], topic: str, received: Path | None, rtt: str, trace: Path | None,
-    picture: Path | None, json_file: Path | None,
+    interval: float | None, columns: tuple[str, ...], delimiter: str, topic: str, received: Path | None, rtt: str,
+    trace: Path | None, picture: Path | None, json_file: Path | None,
 ) -> None:  # fmt: skip
     """Show what FILE says of a link: output of ping, irtt, owping, iperf3, a capture, a table, a bag, a line for netem.
 
@@ -68,7 +69,7 @@ def command(
     from agv_analysis.scenario import load_scenario
 
     scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
-    options = Options(interval, dict(map(_column, columns)), topic, received)
+    options = Options(interval, dict(map(_column, columns)), delimiter, topic, received)
     reading = read_file(file, options, name or "")
     console = Console(highlight=False)
     if isinstance(reading, Setting):

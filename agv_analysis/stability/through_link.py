@@ -170,7 +170,7 @@ def through_trace(scenario: Scenario, link: LinkOfLoop, file: Path) -> ThroughLi
     deviations = deviations_of(found, windows)
     return ThroughLink(
         decide(evidence), evidence.confidence, deviations, seconds, longest, corridor,
-        judged=slots * ts if slots == _MOST_SLOTS else None,
+        judged=slots * ts if span >= (slots + 1) * ts else None,
     )  # fmt: skip
 
 

@@ -48,7 +48,7 @@ def read_link(path: str | Path, options: Options | None = None, name: str = "") 
     Raises MeasurementError for a file that is no measurement of a link; the text says what it is, and what to do.
     """
     path, options = Path(path), options or Options()
-    found = format_of(path, name or ("table" if options.columns else ""))
+    found = format_of(path, name or ("table" if options.columns or options.delimiter else ""))
     if options.received is not None and found.name != "capture":
         raise MeasurementError(f"{path}: is no capture ({found.title}), and --received is a capture of the other end")
     return found.read(path, options)

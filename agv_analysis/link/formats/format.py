@@ -19,6 +19,8 @@ class Options:
     """Time between packets sent [s], for files without times."""
     columns: Mapping[str, str] = field(default_factory=dict)
     """Of a table: the name of the column that is the `time`, `seq`, `sent`, `received`, `lost`, `delay` or `rtt`."""
+    delimiter: str = ""
+    """What separates its cells; by default what splits the header into most names."""
     topic: str = ""
     """Of a bag."""
     received: Path | None = None

@@ -41,6 +41,12 @@ _WITH_UNIT = re.compile(rf"(.+?)(?:[\s_/,:]+(?:in\s+)?|\s*[\[(]\s*)({'|'.join(_U
 
 _SEPARATORS = (",", ";", "\t", "|")
 
+BLANKS = " "
+"""The separator of a table whose cells are apart by blanks or tabulators, as many as there are."""
+
+_NAMED = {"tab": "\t", "\\t": "\t", "space": BLANKS, "blank": BLANKS, "comma": ",", "semicolon": ";"}
+"""Separators that are hard to write on a command line."""
+
 
 class TableColumn(NamedTuple):
     """A column that says something of packets."""
@@ -65,19 +71,38 @@ class Header(NamedTuple):
         return self.separator != ","
 
 
-def header_of(head: bytes) -> Header:
-    """The header in the beginning of a file. A line with # before it is a comment, unless it names columns itself."""
+def header_of(head: bytes, separator: str = "") -> Header:
+    """The header in the beginning of a file. A line with # before it is a comment, unless it names columns itself.
+
+    The `separator` is by default the one that splits it into most names. Raises MeasurementError for one that is none.
+    """
+    separator = _NAMED.get(separator, separator)
+    if separator and (len(separator) > 1 or not separator.isascii() or separator in '"#\r\n'):
+        raise MeasurementError(f"--delimiter must be one character, or one of {', '.join(_NAMED)}; got {separator!r}")
     lines = head.decode("utf-8-sig", "replace").splitlines() or [""]
     for number, line in enumerate(lines, start=1):
-        found = _header(line.lstrip("#").strip() if line.startswith("#") else line, number)
+        found = _header(line.lstrip("#").strip() if line.startswith("#") else line, number, separator)
         if line.strip() and (not line.startswith("#") or is_enough({one.role for one in columns_of(found)})):
             return found
-    return _header(lines[0], 1)
+    return _header(lines[0], 1, separator)
 
 
-def _header(line: str, number: int) -> Header:
+def _header(line: str, number: int, separator: str) -> Header:
     text = line.strip("\r\n")
-    separator = max(_SEPARATORS, key=text.count)
+    if not separator:
+        separator = max(_SEPARATORS, key=text.count)
+        found = _split(text, separator, number)
+        if separator in text or is_enough({one.role for one in columns_of(found)}):
+            return found
+        apart = _split(text, BLANKS, number)
+        roles = {one.role for one in columns_of(apart)}
+        return apart if len(roles) > 1 and is_enough(roles) else found
+    return _split(text, separator, number)
+
+
+def _split(text: str, separator: str, number: int) -> Header:
+    if separator == BLANKS:
+        text = " ".join(text.split())
     try:
         names = next(csv.reader([text], delimiter=separator, skipinitialspace=True), [""])
     except csv.Error:  # no text

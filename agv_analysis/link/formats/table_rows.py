@@ -11,6 +11,7 @@ from agv_analysis.link.formats.format import Options
 from agv_analysis.link.formats.rows import floats_at
 from agv_analysis.link.formats.table_cells import dates_at, flags_at, is_date, trimmed
 from agv_analysis.link.formats.table_header import (
+    BLANKS,
     FLAGS,
     INSTANTS,
     ROLES,
@@ -35,7 +36,7 @@ class TableRows:
     """Reads the rows of a table, block by block."""
 
     def __init__(self, path: Path, options: Options) -> None:
-        self.header: Header = header_of(head_of(path))
+        self.header: Header = header_of(head_of(path), options.delimiter)
         self.columns = columns_of(self.header, options.columns, str(path))
         self.roles = {column.role for column in self.columns}
         self.malformed = Malformed()
@@ -78,7 +79,9 @@ class TableRows:
 
     def _separates(self, text: Bytes) -> NDArray[np.bool_]:
         """Which characters are separators, and not between quotation marks?"""
-        found, marks = text == ord(self.header.separator), text == ord('"')
+        separator = self.header.separator
+        found = _last_of_blanks(text) if separator == BLANKS else text == ord(separator)
+        marks = text == ord('"')
         if marks.any():
             upto, ends = np.cumsum(marks), np.flatnonzero(text == ord("\n"))
             of_lines = np.diff(upto[ends], prepend=0)
@@ -135,3 +138,16 @@ class TableRows:
                     f"{role} has no unit, and numbers that are dates in units of {unit:g} s: it is taken for that"
                 )
         return said
+
+
+def _last_of_blanks(text: Bytes) -> NDArray[np.bool_]:
+    """The last one of blanks and tabulators that stand together, if they are within a line and not at its beginning."""
+    is_blank = (text == ord(" ")) | (text == ord("\t"))
+    first = is_blank & ~np.append(False, is_blank[:-1])
+    last = is_blank & ~np.append(is_blank[1:], False)
+    begins, ends = np.flatnonzero(first), np.flatnonzero(last)
+    before, behind = text[np.maximum(begins - 1, 0)], text[np.minimum(ends + 1, len(text) - 1)]
+    is_within = (begins > 0) & (before != ord("\n")) & (behind != ord("\n")) & (behind != ord("\r"))
+    found = np.zeros(len(text), dtype=np.bool_)
+    found[ends[is_within]] = True
+    return found

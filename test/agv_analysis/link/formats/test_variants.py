@@ -288,19 +288,32 @@ def test_tables_of_spreadsheets_and_scripts(tmp_path: Path, text: str) -> None:
     assert ("commas are taken for decimal marks" in said(found)) == (";" in text.splitlines()[0])
 
 
+@pytest.mark.parametrize(
+    ("text", "options"),
+    [
+        ("  time   lost  rtt_ms\n  0.0    0     5.0\n0.02\t1 \t nan\r\n 0.04  0  7.0  \n", Options()),
+        ("when:gone:rtt_ms\n0.0:0:5.0\n0.02:1:\n0.04:0:7.0\n",
+         Options(delimiter=":", columns={"time": "when", "lost": "gone"})),
+        ("when gone rtt_ms\n0,0 0 5,0\n0,02 1 -\n0,04 0 7,0\n",
+         Options(delimiter="space", columns={"time": "when", "lost": "gone"})),
+        ("RTT [ms];a,b,c,d;t\n5.0;1,2,3,4;0\n;;0.02\n7.0;;0.04\n", Options(delimiter=";")),
+    ],
+)  # fmt: skip
+def test_tables_with_any_separator(tmp_path: Path, text: str, options: Options) -> None:
+    found = read(tmp_path / "a", text, options)
+    assert (lost(found), found.malformed.count) == ([1], 0)
+    assert found.sent.tolist() == pytest.approx([0.0, 0.02, 0.04])
+    assert delays(found) == pytest.approx([0.005, NAN, 0.007], nan_ok=True)
+
+
+def test_a_delimiter_is_one_character(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=r"--delimiter must be one character, .*got '::'"):
+        read(tmp_path / "a", "time::lost\n0::1\n", Options(delimiter="::", columns={"lost": "lost"}))
+
+
 def test_numbers_of_a_table_are_those_that_python_reads(tmp_path: Path) -> None:
-    cells = [
-        "2.5e-03",
-        "-1.25E+2",
-        "1e5",
-        "5",
-        ".5",
-        "-0.0625",
-        "0.0312345678901234567890",
-        "9.012345678901234567e-03",
-        "1e-12",
-        "7.e2",
-    ]
+    digits = ["0.0312345678901234567890", "9.012345678901234567e-03"]
+    cells = [*digits, "2.5e-03", "-1.25E+2", "1e5", "5", ".5", "-0.0625", "1e-12", "7.e2"]
     rows = "".join(f"{cell},0\n" for cell in cells)
     found = read(tmp_path / "a", "time,lost\n" + rows + "1e5.,0\n1e,0\n.e1,0\n")
     expected = np.sort([float(cell) for cell in cells])
