@@ -29,8 +29,11 @@ _USUAL_INTERVAL = 1.0
 """Time between packets that ping takes without -i [s]."""
 
 _HEADER = re.compile(rb"PING6?[\s(]")
-_SUMMARY = re.compile(rb"(\d+) [^\d,%]+, \d+ .*%[^,]*(?:, \D*(\d+) ?ms)?")
-"""The same in every language: packets sent, received, a percentage, and perhaps the time."""
+_SUMMARY = re.compile(
+    rb"[^\d%]*(\d+)[^\d,%]*(?:,|\xef\xbc\x8c|\xe3\x80\x81)[^\d%]*\d+[^\d%].*[^\w:.][\d.]+ ?%"
+    rb"[^,]*(?:, ?[^\d,]*(\d+) ?(?:ms|[\x80-\xff]))?"
+)
+"""The same in every language: packets sent, received, a percentage, and perhaps the time; commas may be Chinese."""
 _REPLY = re.compile(rb"[:,] (?:icmp_)?seq=\d+ (?:ttl|hlim)=\d+|no answer yet for icmp_seq=\d+")
 _OTHER = re.compile(
     rb"-+ .* -+|(rtt|round-trip) .*|\^C|\d+ packets transmitted.*|pipe \d+|ping6?: .*|WARNING: .*"
@@ -115,16 +118,21 @@ def _read_block(block: Block, found: _Found, path: Path) -> None:
 
 
 def _milliseconds(block: Block, places: Places, lines: int) -> Floats:
-    """The numbers at these places that ` ms` follows, by line [s], NaN on lines that have none.
+    """The numbers at these places that ` ms` or a word in other letters follows, by line [s], NaN on lines without one.
 
-    Whatever is before them: ping speaks the user's language.
+    Whatever is before them: ping speaks the user's language, and its only unit is that.
     """
     text, last = block.text, len(block.text) - 1
     numbers = numbers_at(text, places, commas=True)
     ends = places + numbers.length
-    is_time = numbers.length > 0
-    for i, letter in enumerate(b" ms"):
-        is_time &= text[np.minimum(ends + i, last)] == letter
+    behind = np.minimum(ends + (text[np.minimum(ends, last)] == ord(" ")), last)
+    is_time = text[behind] >= 0x80
+    if not is_time.all():
+        is_ms = np.ones(len(ends), dtype=np.bool_)
+        for i, letter in enumerate(b" ms"):
+            is_ms &= text[np.minimum(ends + i, last)] == letter
+        is_time |= is_ms
+    is_time &= numbers.length > 0
     values = np.full(lines, np.nan)
     values[block.line_of(places[is_time])] = 1e-3 * numbers.values[is_time]
     return values

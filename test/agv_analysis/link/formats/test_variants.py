@@ -78,6 +78,8 @@ def test_ping_with_decimal_commas_and_in_another_language(tmp_path: Path) -> Non
         "5 paquets transmis, 3 reçus, 40% packet loss, time 80ms",
         "5 packets transmitted, 3 received, +1 errors, 40% packet loss, time 80ms",
         "5 packets transmitted, 3 received, 1 packets out of wait time, 40.0% packet loss, time 80ms",
+        "送信パケット数 5, 受信パケット数 3, パケット損失 40%, 時間 80ミリ秒",
+        "已发送 5 个包， 已接收 3 个包, 40% packet loss, time 80ms",
     ],
 )
 def test_the_summary_of_ping_counts_what_was_lost_last_in_any_language(tmp_path: Path, summary: str) -> None:
@@ -88,6 +90,20 @@ def test_the_summary_of_ping_counts_what_was_lost_last_in_any_language(tmp_path:
     found = read(tmp_path / "a", text + "\nrtt min/avg/max/mdev = 0,5/0,5/0,5/0,0 ms\n")
     assert (found.packets, lost(found), found.malformed.count) == (5, [3, 4], 0)
     assert found.interval == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "64 バイト応答 送信元 1.1.1.1: icmp_seq={} ttl=64 時間=121 ミリ秒",
+        "64 バイト応答 送信元 1.1.1.1: icmp_seq={} ttl=64 時間=121ミリ秒",
+        "64 字节，来自 1.1.1.1: icmp_seq={} ttl=64 时间=121 毫秒",
+        "64 байт из 1.1.1.1: icmp_seq={} ttl=64 время=121 мс",
+    ],
+)
+def test_ping_with_a_unit_in_other_letters(tmp_path: Path, line: str) -> None:
+    found = read(tmp_path / "a", "\n".join(line.format(n) for n in (1, 3)) + "\n")
+    assert delays(found) == pytest.approx([0.121, NAN, 0.121], nan_ok=True)
 
 
 def test_ping_that_was_cut_at_its_beginning_and_in_a_number(tmp_path: Path) -> None:
