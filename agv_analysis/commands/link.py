@@ -68,6 +68,8 @@ def command(
     from agv_analysis.link.measurement import LossRates, Setting
     from agv_analysis.scenario import load_scenario
 
+    if params is None and (settings or corridor is not None):
+        raise click.UsageError("--set and --corridor are about the loop of a params file: give PARAMS behind FILE")
     scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
     options = Options(interval, dict(map(_column, columns)), delimiter, topic, received)
     reading = read_file(file, options, name or "")
@@ -80,8 +82,10 @@ def command(
         found = show_measurement(console, reading, scenario, rtt, trace, picture)
     if json_file is not None:
         write_json(json_file, found)
-    if isinstance(reading, LossRates) and (scenario is not None or trace is not None):
+    if isinstance(reading, LossRates) and (scenario is not None or trace is not None or picture is not None):
         raise click.ClickException(reading.refusal)
+    if isinstance(reading, Setting) and (trace is not None or picture is not None):
+        raise click.ClickException(f"{reading.source}: {reading.line!r} is a setting, of which there is no measurement")
 
 
 def _column(text: str) -> tuple[str, str]:

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from agv_analysis.commands.link import command
 from agv_analysis.link.formats import read_link
 from agv_analysis.link.link_figures import LinkFigures
 from agv_analysis.link.measured_trace import HALF, ROUND_TRIPS, link_of_loop, of_trace, write_trace
@@ -210,3 +212,20 @@ def test_what_a_file_cannot_say_is_said_in_a_line(tmp_path: Path, agv_ncs: AgvNc
     assert "a loss rate, but no trace to drive a loop with" in said.splitlines()[-1]
     status, said = agv_ncs("link", tmp_path / "none")
     assert (status, said.strip()) == (1, f"Error: {tmp_path / 'none'}: no such file")
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["loss 5%", "--trace", "{}"], "is a setting, of which there is no measurement"),
+        (["loss 5%", "--picture", "{}"], "is a setting, of which there is no measurement"),
+        (["loss 5%", "--corridor", "0.5"], "give PARAMS behind FILE"),
+        (["loss 5%", "--set", "controller.kx=5.0"], "give PARAMS behind FILE"),
+    ],
+)
+def test_what_is_asked_for_in_vain_is_refused(tmp_path: Path, options: list[str], complaint: str) -> None:
+    target = tmp_path / "output"
+    done = CliRunner().invoke(command, [option.format(target) for option in options])
+    assert done.exit_code != 0
+    assert complaint in " ".join(done.output.split())
+    assert not target.exists()
