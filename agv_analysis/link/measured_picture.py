@@ -20,6 +20,7 @@ _MOST_POINTS = 20_000
 def draw_link(path: Path, found: LinkFigures) -> None:
     """Draw to a file. Raises UserError if that fails."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
 
     from agv_analysis.report.matplotlib_figures import COLOURS
     from agv_analysis.report.panels import DRIVEN, LOST, OTHER
@@ -52,6 +53,8 @@ def draw_link(path: Path, found: LinkFigures) -> None:
         ordered = np.sort(whole.outages)[::-1]
         outages.step(1e3 * ordered, np.arange(1, len(ordered) + 1), where="post", color=COLOURS[LOST])
         outages.set(xscale="log", yscale="log", xlim=(5e2 * ordered[-1], 2e3 * ordered[0]))
+        outages.xaxis.set_major_formatter(LogFormatter())
+        outages.xaxis.set_minor_formatter(LogFormatter())  # 20, as powers of ten would not fit beside each other
     outages.set(xlabel="length [ms]", ylabel="outages at least as long", title="Outages")
     for direction in found.directions.values():
         values = getattr(measured, direction.name).delay
