@@ -62,9 +62,9 @@ def print_corridor(
     """
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
     from agv_analysis.corridor.corridor_of_run import corridor_of_run
+    from agv_analysis.report.table import print_groups
 
     with Console(stderr=True).status("within the corridor ...") as status:
         found = corridor_of_run(
@@ -72,12 +72,8 @@ def print_corridor(
         )
     if found is None:
         return None
-    console, table = Console(highlight=False), Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
-    for name, value in found.rows():
-        table.add_row(name, escape(value))
-    console.print(table)
+    console = Console(highlight=False)
+    print_groups(console, [("Corridor", [(name, escape(value)) for name, value in found.rows()])])
     for note in found.notes:
         console.print(f"[bold yellow]Corridor:[/] {escape(note)}.")
     return found

@@ -12,9 +12,13 @@ import click
 from agv_analysis.commands import OUTPUT, corridor_settings, with_corridor, with_force, with_settings, write_json
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from agv_analysis.corridor.corridor import Corridor
     from agv_analysis.scenario import Scenario
     from agv_analysis.stability.empirical import Twins
     from agv_analysis.stability.gains import GainChoice
+    from agv_analysis.stability.verdict import Evidence, Verdict
 
 
 _POLICIES = {
@@ -75,12 +79,12 @@ def command(
 
     from rich.console import Console
     from rich.markup import escape
-    from rich.table import Table
 
     from agv_analysis.corridor.corridor import corridor
     from agv_analysis.corridor.kept_with_confidence import kept_with_confidence
     from agv_analysis.output_file import output_file
-    from agv_analysis.report.table import colour_of
+    from agv_analysis.report.table import print_framed, print_groups
+    from agv_analysis.report.verdict_sentence import by_what
     from agv_analysis.scenario import load_scenario
     from agv_analysis.stability.empirical import simulated_twins, too_short, with_an_end
     from agv_analysis.stability.evidence import evidence_of_scenario
@@ -112,22 +116,21 @@ def command(
         verdict = decide(evidence)
         within = within_it.result()
         kept = None if confidence is None else kept_with_confidence(scenario, confidence, laps, within_corridor)
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
-    policy = scenario.error_detector.policy
-    table.add_row("Verdict", f"[bold {colour_of(verdict.word)}]{verdict.word}[/] (by {verdict.criterion})")
-    table.add_row("Because", escape(verdict.reason))
-    table.add_row("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
+    print_framed(console, _headlines(verdict, evidence, within))
     said_of_twins = _told(twins, seeds)
     if twins.contracting and not settles_without_losses(scenario):
         said_of_twins += "; they come together, but the loop does not settle even without losses"
     elif not twins.is_long_enough and settles_without_losses(scenario):
         said_of_twins += f"; {too_short(twins.left_without_losses)}"
-    of_corridor = [*(() if within is None else within.rows()), *(() if kept is None else kept.rows())]
-    for name, value in (*found.rows(), ("Simulation check", said_of_twins), *of_corridor):
-        table.add_row(name, escape(value))
-    console.print(table)
+    policy = scenario.error_detector.policy
+    outdated = ("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
+    groups = {
+        "How much the loop can take": [outdated, *found.rows(), ("Simulation check", said_of_twins)],
+        "Corridor": [*(() if within is None else within.rows()), *(() if kept is None else kept.rows())],
+        "Verdict": [("Decided by", by_what(verdict.criterion)), ("Because", verdict.reason)],
+    }
+    shown = ((title, [(name, escape(value)) for name, value in rows]) for title, rows in groups.items() if rows)
+    print_groups(console, shown)
     best, why_no_gain = _best_gains(scenario)
     for objective, choice in best.items():
         console.print(f"Best K_x, {objective.replace('_', ' ')}: {escape(choice.words)}")
@@ -154,6 +157,23 @@ def command(
         write_json(json_file, {**word, **found.to_json(), **_gains_to_json(best, why_no_gain)})
 
 
+def _headlines(verdict: Verdict, evidence: Evidence, within: Corridor | None) -> Iterator[tuple[str, str]]:
+    """Is it stable, how far does it stray, how much more can it take: with rich's markup."""
+    from rich.markup import escape
+
+    from agv_analysis.report.table import colour_of
+    from agv_analysis.report.verdict_sentence import in_words
+    from agv_analysis.stability.verdict import GREEN
+
+    said = in_words(verdict.word, evidence.n)
+    yield "Verdict", f"[bold {colour_of(verdict.word)}]{said[0].upper()}{said[1:]}[/]"
+    if verdict.word not in GREEN:
+        yield "Because", escape(verdict.reason)
+    yield "Deviation", "--corridor METRES says how far it strays" if within is None else escape(within.in_short)
+    if verdict.word in GREEN:
+        yield "Margin", escape(verdict.margin)
+
+
 def _told(twins: Twins, seeds: range) -> str:
     """What twins did, in words."""
     if twins.different == 1 < len(seeds):
@@ -163,6 +183,8 @@ def _told(twins: Twins, seeds: range) -> str:
     converge = f"neighbouring trajectories converge {runs}"
     if not math.isfinite(twins.median):
         return f"{converge}; the others diverge"
+    if twins.median == 0.0:
+        return f"{converge}, in the median until no distance is left"
     return f"{converge}, in the median to {twins.median:.2g} of their distance"
 
 

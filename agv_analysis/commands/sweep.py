@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -161,7 +161,7 @@ def _write_reports(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None
 def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
 
-    from agv_analysis.report.table import metres
+    from agv_analysis.report.table import metres, print_framed
     from agv_analysis.sweep.verdicts import counted
 
     names = ("unstable\nruns", "share of\nthem", "95 %\nconfidence", "steps to\n1 cm", "largest\ndeviation")
@@ -174,6 +174,7 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
             metres(row["deviation_max_p50"]),
         )  # fmt: skip
     console = Console(highlight=False)
+    print_framed(console, _headlines(sweep, rows))
     console.print(table)
     if rows and "verdict" in rows[0]:
         console.print(_verdicts(sweep, rows))
@@ -186,6 +187,24 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
             f"[bold yellow]Undecided:[/] {unsaid} runs are shorter than the transient of the loop without losses, "
             "so twins that are not closer by their end say nothing; make plant.duration longer."
         )
+
+
+def _headlines(sweep: Sweep, rows: list[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+    """Where the loop is stable, how far it strays at best, and how sure that is: with rich's markup."""
+    from rich.markup import escape
+
+    from agv_analysis.report.table import metres
+    from agv_analysis.sweep.sweep_sentence import best_point, is_calm, sweep_sentence
+
+    yield "Verdict", escape(sweep_sentence(rows, *sweep.axes))
+    calm = [row for row in rows if is_calm(row)]
+    if not calm:
+        return
+    best = best_point(rows)
+    where = ", ".join(f"{axis.name} {_plain(best[axis.name])}" for axis in sweep.axes)
+    yield "Deviation", f"at most {metres(best['deviation_max_p50'])} at {where}, the best point (median of the runs)"
+    sure = 100.0 * max(row["instability_high"] for row in calm)
+    yield "Confidence", f"at the stable points below {sure:.3g} % of all runs unstable (95 %)"
 
 
 _IN_A_LAP = "leaves in\na lap"

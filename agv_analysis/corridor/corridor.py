@@ -18,6 +18,7 @@ from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stat
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.metrics.confidence import percent
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
@@ -80,6 +81,14 @@ class Corridor:
         """
         return None if self.single is None else self.single.n
 
+    @property
+    def in_short(self) -> str:
+        """How far the AGV strays, in a line: what is proved of it, and how often it leaves the corridor."""
+        leaves = f"leaves {_widths(self.widths)} with a probability of {probability(self.leaving.p_lap)} a lap"
+        if self.rms.value is None:
+            return leaves
+        return f"{f'RMS {self.rms.value:.3g} m' if math.isfinite(self.rms.value) else 'diverges'}; {leaves}"
+
     def rows(self) -> Iterator[tuple[str, str]]:
         """Name and value of each figure, in plain text."""
         yield "Corridor", _widths(self.widths)
@@ -120,7 +129,7 @@ class Corridor:
 
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
-        return f"{_percent(lap)} a lap, {_percent(hour)} an hour (by {self.leaving.method})"
+        return f"{probability(lap)} a lap, {probability(hour)} an hour (by {self.leaving.method})"
 
     def to_json(self) -> dict[str, Any]:
         """The figures by name; SI units, intervals of 95 %."""
@@ -301,10 +310,15 @@ def _widths(widths: Widths) -> str:
     return f"{widths.across:g} m across the track, {widths.along:g} m along it"
 
 
-def _percent(p: Estimate) -> str:
+def probability(p: Estimate) -> str:
+    """A probability with its interval; of a rare event not in per cent."""
     if p.low == p.high:
-        return f"{p.value:.4g}"
-    return f"{p.value:.3g} ({p.low:.3g} .. {p.high:.3g})"
+        return f"{p.value:.4g}" if 0.0 < p.value < 0.001 else percent(p.value)
+    if p.value < 0.001:
+        return f"{p.value:.3g} ({p.low:.3g} .. {p.high:.3g})"
+    if p.low > 0.999:
+        return "above 99.9 %"
+    return f"{percent(p.value)} ({percent(p.low)} .. {percent(p.high)})"
 
 
 def _time(mean: Estimate | None) -> str:

@@ -22,6 +22,13 @@ def clopper_pearson(hits: int, trials: int, confidence: float = CONFIDENCE) -> t
     return low, high
 
 
+def percent(probability: float) -> str:
+    """A probability in three digits, never rounded to certainty."""
+    if 0.999 < probability < 1.0:
+        return "above 99.9 %"
+    return "below 0.1 %" if 0.0 < probability < 0.001 else f"{100.0 * probability:.3g} %"
+
+
 def _at_most(hits: int, trials: int, p: float) -> float:
     """P(X <= hits) for X binomial, 0 < p < 1."""
     k = np.arange(hits + 1)

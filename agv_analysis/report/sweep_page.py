@@ -17,11 +17,11 @@ from agv_analysis.report.sweep_table import number, sweep_table
 from agv_analysis.report.table import metres
 from agv_analysis.report.tiles import Tile
 from agv_analysis.simulation.single import simulate, steps_of
-from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE
 from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.picture import INSTABILITY_COLOURS, across_and_up, border_colour, can_draw, draw
 from agv_analysis.sweep.plan import Axis, Sweep, varied
+from agv_analysis.sweep.sweep_sentence import Rows, best_point, is_calm, sweep_sentence
 from agv_analysis.sweep.verdicts import counted
 from agv_ros.errors import UserError
 
@@ -36,26 +36,6 @@ _MOST_LAPS = 400
 _LAP_POINTS = 300
 """Points of a lap in the page: the lowest and the highest of each two pixels."""
 
-Rows = list[dict[str, Any]]
-
-
-def sweep_sentence(rows: Rows) -> str:
-    """What a sweep found, in one sentence: a point counts as stable if every run is and its verdict does not object."""
-    if not rows:
-        return "No point of the sweep was run."
-    short = sum(row.get("undecided", 0) > 0 for row in rows)
-    calm = sum(_is_calm(row) for row in rows)
-    bad = sum(row["unstable"] == row["runs"] for row in rows)
-    if calm == len(rows):
-        return f"The loop is stable in every run at all {len(rows)} points."
-    too_short = f"; at {short} runs are too short to say" if short else ""
-    return f"Of {len(rows)} points the loop is stable in every run at {calm}, and in none at {bad}{too_short}."
-
-
-def _is_calm(row: dict[str, Any]) -> bool:
-    is_green = row.get("verdict", MEAN_SQUARE) in GREEN
-    return row["unstable"] == 0 and not row.get("undecided") and is_green
-
 
 def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> None:
     """Write the report of a sweep; `command` repeats it. Raises UserError as `write_report`."""
@@ -69,7 +49,7 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
         figures=drawn,
         more={"laps": laps},
         data={
-            "sentence": sweep_sentence(rows),
+            "sentence": sweep_sentence(rows, *sweep.axes),
             "words": counted(rows),
             "axes": [axis.name for axis in (across_and_up(sweep) if len(sweep.axes) == 2 else sweep.axes)],
             "points": plain,
@@ -78,14 +58,14 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
             "versions": versions(),
         },
         title="agv_ncs: sweep",
-        verdict=sweep_sentence(rows),
+        verdict=sweep_sentence(rows, *sweep.axes),
         word="unknown",
         words=counted(rows),
         tiles=list(_tiles(sweep, rows)),
         sections=[{"key": key, "title": "Probability of instability", "height": 520} for key in drawn],
         axes=[(axis.name, axis_words(axis, sweep.base)) for axis in sweep.axes],
         has_laps=any(laps),
-        chosen=rows.index(_best(rows)) if rows else -1,
+        chosen=rows.index(best_point(rows)) if rows else -1,
         heads=heads,
         rows=cells[:_MOST_ROWS],
         left_out=max(0, len(plain) - _MOST_ROWS),
@@ -101,21 +81,15 @@ def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
     """What is asked first of a sweep."""
     if not rows:
         return
-    calm = [row for row in rows if _is_calm(row)]
+    calm = [row for row in rows if is_calm(row)]
     yield Tile("stable", "Stable in every run", f"{len(calm)} of {len(rows)} points", "")
     if calm:
-        best = _best(rows)
+        best = best_point(rows)
         where = ", ".join(f"{axis.name} {number(best[axis.name])}" for axis in sweep.axes)
         yield Tile("deviation", "Smallest worst deviation", metres(best["deviation_max_p50"]), f"at {where} (median)")
         sure = max(row["instability_high"] for row in calm)
         said = f"by {calm[0]['runs']} runs at each point, with 95 % confidence"
         yield Tile("sure", "How sure", f"below {100.0 * sure:.3g} % unstable", said)
-
-
-def _best(rows: Rows) -> dict[str, Any]:
-    """The point with the smallest worst deviation, of those that are stable if there are some."""
-    found = [row for row in rows if _is_calm(row)] or rows
-    return min(found, key=lambda row: (math.isnan(row["deviation_max_p50"]), row["deviation_max_p50"]))
 
 
 def _laps(sweep: Sweep, rows: Rows) -> Iterator[dict[str, Any] | None]:

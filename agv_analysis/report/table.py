@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,11 +12,14 @@ from agv_analysis.metrics.convergence import Convergence
 from agv_analysis.metrics.deviation import DIVERGED, Deviation, Peak
 from agv_analysis.metrics.last_excursion import LastExcursion
 from agv_analysis.metrics.outages import loss_causes
-from agv_analysis.report.verdict_sentence import in_short
+from agv_analysis.report.verdict_sentence import by_what, in_short
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.margins import margins
 from agv_analysis.stability.verdict import BOUNDED, GREEN, UNDECIDED, UNKNOWN
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _YELLOW = (BOUNDED, UNDECIDED, UNKNOWN)
 
@@ -32,31 +36,45 @@ def print_table(analysis: Observations) -> None:
     """Print the verdict in a frame, then the figures in groups, disagreements between the criteria, and notes."""
     from rich.console import Console
     from rich.markup import escape
-    from rich.panel import Panel
-    from rich.table import Table
 
     console = Console(highlight=False)
     for topic, count in analysis.run.unexplained.items():
         console.print(
             f"[bold red]Invalid:[/] {count} messages of {escape(topic)} are missing, and no channel lost them."
         )
-    frame = Table.grid(padding=(0, 2))
-    frame.add_column(style="bold")
-    for name, value in headline_rows(analysis):
-        frame.add_row(name, value)
-    console.print(Panel(frame, expand=False))
-    table = Table(box=None, show_header=False, pad_edge=False)
-    table.add_column(style="bold")
-    table.add_column()
-    for title, group in grouped_rows(analysis):
-        table.add_row(f"[dim]{title}[/]")
-        for name, value in group:
-            table.add_row(f"  {name}", value)
-    console.print(table)
+    print_framed(console, headline_rows(analysis))
+    print_groups(console, grouped_rows(analysis))
     for sentence in _disagreements(analysis):
         console.print(f"[bold yellow]They disagree:[/] {sentence}.")
     for note in analysis.run.notes:
         console.print(f"[dim]Note: {escape(note)}.[/]")
+
+
+def print_framed(console: Console, headlines: Iterable[tuple[str, str]]) -> None:
+    """Print names and values, text with rich's markup, in a frame: what a command answers first."""
+    from rich.panel import Panel
+    from rich.table import Table
+
+    frame = Table.grid(padding=(0, 2))
+    frame.add_column(style="bold")
+    for name, value in headlines:
+        frame.add_row(name, value)
+    console.print(Panel(frame, expand=False))
+
+
+def print_groups(console: Console, groups: Iterable[tuple[str, Iterable[tuple[str, str]]]]) -> None:
+    """Print names and values, text with rich's markup, in one table under the title of each group."""
+    from rich.padding import Padding
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column()
+    for title, group in groups:
+        table.add_row(f"[dim]{title}[/]")
+        for name, value in group:
+            table.add_row(Padding(name, (0, 0, 0, 2)), value)
+    console.print(table)
 
 
 def print_side_by_side(analyses: Mapping[str, Observations]) -> None:
@@ -131,7 +149,7 @@ def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     ms = 1e3 * run.ts
     seed = f", seed {run.scenario.relay.seed}" if run.seed_known else ""
     yield "Run", f"{len(run)} steps of {ms:g} ms{seed}"
-    yield "Uplink", f"{up.loss_rate:.2%} lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
+    yield "Uplink", f"{100.0 * up.loss_rate:.3g} % lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
     if len(causes := loss_causes(run.uplink)) > 1:
         yield "Lost by", ", ".join(f"{cause} ({count})" for cause, count in causes.items())
     yield "Longest outage", f"{up.longest} slots ({up.longest * ms:g} ms)"
@@ -150,7 +168,7 @@ def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     if down.lost or down.age.max:
         yield (
             "Downlink",
-            f"{down.loss_rate:.2%} lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
+            f"{100.0 * down.loss_rate:.3g} % lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
         )
     yield "Fitted channel", _fit(analysis)
 
@@ -173,7 +191,7 @@ def convergence_rows(found: Convergence, ms: float) -> Iterator[tuple[str, str]]
         "Overshoot",
         "not known"
         if found.overshoot is None or np.isinf(found.overshoot)
-        else f"{found.overshoot:.2%} of the initial error",
+        else f"{100.0 * found.overshoot:.3g} % of the initial error",
     )
     yield "Damping of the speed", found.damping or "the run cannot tell"
     yield "Last excursion above 1 cm", _excursion(found.excursion)
@@ -212,13 +230,6 @@ def metres(value: float) -> str:
     return f"{value:.3g} m" if value <= DIVERGED else "diverges"
 
 
-def percent(probability: float) -> str:
-    """A probability in three digits, never rounded to certainty."""
-    if 0.999 < probability < 1.0:
-        return "above 99.9 %"
-    return "below 0.1 %" if 0.0 < probability < 0.001 else f"{100.0 * probability:.3g} %"
-
-
 def _excursion(found: LastExcursion | None) -> str:
     if found is None:
         return "none"
@@ -247,7 +258,7 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
         if found.why:
             yield found.label, _judged(found.stable, escape(found.why))
     verdict = analysis.verdict
-    yield "Verdict", f"[bold {colour_of(verdict.word)}]{verdict.word}[/] (by {verdict.criterion})"
+    yield "Verdict", f"[bold {colour_of(verdict.word)}]{verdict.word}[/] (by {by_what(verdict.criterion)})"
     if verdict.word in GREEN:
         yield "Margin", escape(verdict.margin)
     yield "Because", escape(verdict.reason)
@@ -260,8 +271,8 @@ def _fit(analysis: Observations) -> str:
     if fit.model == "perfect":
         return "perfect"
     if fit.model == "bernoulli" or fit.p is None or fit.r is None:
-        return f"bernoulli, p {_interval(fit.loss_rate)}"
-    return f"gilbert_elliott, p {_interval(fit.p)}, r {_interval(fit.r)}"
+        return f"Bernoulli, p {_interval(fit.loss_rate)}"
+    return f"Gilbert-Elliott, p {_interval(fit.p)}, r {_interval(fit.r)}"
 
 
 def _interval(estimate: Estimate) -> str:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
-from agv_analysis.report.table import metres, percent
+from agv_analysis.metrics.confidence import percent
+from agv_analysis.report.table import metres
 from agv_analysis.stability.analysis import Analysis, Observations
 from agv_analysis.stability.verdict import GREEN
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
+from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.verdict import (
     ASYMPTOTIC,
     BESIDE,
@@ -60,17 +61,38 @@ def in_short(analysis: Observations) -> str:
         return "stable; no update was lost"
     if word == ASYMPTOTIC and _is_late(analysis):
         return f"stable with poses {n} steps old"
-    if word == ASYMPTOTIC:
-        return f"stable under any outages of up to {n} slots"
     if word == MEAN_SQUARE and n_bursts is not None and n > n_bursts:
         return f"stable in mean square; not guaranteed for the longest outage seen ({n})"
+    return in_words(word, n)
+
+
+def in_words(word: str, n: int) -> str:
+    """A verdict's word in half a line, of a loop whose longest outage is `n` slots."""
     return {
+        ASYMPTOTIC: f"stable under any outages of up to {n} slots" if n else "stable without losses",
         MEAN_SQUARE: "stable in mean square",
         BOUNDED: "bounded; only the speed limit bounds the error",
         UNDECIDED: "undecided; too little was seen of the link",
         INFEASIBLE: "infeasible; the loop does not settle even without losses",
         UNKNOWN: "unknown",
     }.get(word, "unstable; the error grows")
+
+
+def by_what(criterion: str) -> str:
+    """What decided a verdict, in words."""
+    titles = {one.key: one.title[0].lower() + one.title[1:] for one in CRITERIA}
+    return (titles | _OTHER_EVIDENCE).get(criterion, criterion)
+
+
+_OTHER_EVIDENCE = {
+    SIMULATION: "simulation of the nonlinear loop",
+    "nominal_motion": "motion without losses",
+    "recording": "what the recording lacks or contradicts",
+    "confidence": "how much was seen of the link",
+    "v_max": "limit on the speed",
+    "none": "no criterion",
+}
+"""What decides a verdict beside the criteria, by its name in JSON."""
 
 
 def _in_mean_square(analysis: Analysis, met: str) -> str:

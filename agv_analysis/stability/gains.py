@@ -23,6 +23,7 @@ import numpy as np
 
 from agv_analysis.link.markov_channel import Chain
 from agv_analysis.stability.almost_sure import mean_log
+from agv_analysis.stability.criteria.criterion import growth_text
 from agv_analysis.stability.joint_spectral_radius import largest_n_along
 from agv_analysis.stability.mean_square import along_spectral_radius
 
@@ -94,8 +95,10 @@ class GainChoice:
         """Gain and costs in words."""
         if self.kx is None:
             return self.reason
-        square = "dies out" if self.is_usable else "grows"
-        costs = f"E[e^2] {square}, times {math.exp(self.growth):.4g} a step; survives outages of up to {self.survives}"
+        survives = (
+            "no outage" if self.survives < 1 else f"outages of up to {self.survives} slot{'s' * (self.survives > 1)}"
+        )
+        costs = f"{growth_text(self.growth)}; survives {survives}"
         refused = "" if self.is_usable else "not recommended: "
         return f"{self.kx:.4g} 1/s ({refused}{f'{self.reason}; ' if self.reason else ''}{costs})"
 

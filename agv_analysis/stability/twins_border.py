@@ -16,7 +16,7 @@ from agv_analysis.stability.criteria.criterion import Margin
 from agv_analysis.stability.empirical import LONG_ENOUGH, left_without_losses, too_short
 from agv_analysis.stability.repeated_run import settles_without_losses
 
-NAME, LABEL = "p_max.twins", "Independent losses, most twins contract"
+NAME, LABEL = "p_max.twins", "Independent losses, most simulated runs converge"
 
 SEEDS = 20
 """Runs at each loss probability."""
@@ -59,7 +59,7 @@ def twins_border(scenario: Scenario, seeds: int = SEEDS, progress: Callable[[int
     if above is None:
         return Margin(NAME, LABEL, None, reason=f"no bound: most of {seeds} runs contract at every p up to {_GRID[-1]}")
     if above == 0.0:
-        return Margin(NAME, LABEL, None, reason="not met: twins do not contract even without losses")
+        return Margin(NAME, LABEL, None, reason="not met: simulated runs do not converge even without losses")
     below = _GRID[_GRID.index(above) - 1]
     while above - below > _NARROWED:
         middle = 0.5 * (below + above)

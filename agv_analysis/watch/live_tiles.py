@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from agv_analysis.corridor.widths import widths_of
 from agv_analysis.metrics.bands import TOLERANCE
-from agv_analysis.report.table import percent
+from agv_analysis.metrics.confidence import percent
 from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin
 from agv_analysis.watch.live_loop import POINTS, LiveLoop
 

@@ -214,4 +214,10 @@ def steps_text(n: int, ts: float) -> str:
 
 def growth_text(growth: float) -> str:
     """What becomes of the mean square with this growth (logarithm, per step)."""
-    return f"E[e^2] {'dies out' if growth < 0.0 else 'grows'}, times {math.exp(growth):.6g} a step"
+    return f"E[e^2] {'dies out, shrinks' if growth < 0.0 else 'grows'} by {change_text(math.expm1(growth))}"
+
+
+def change_text(share: float) -> str:
+    """By what share something changes at each step, in per cent: without more digits than the share deserves."""
+    change = 100.0 * abs(share)
+    return f"{change:{'.2g' if change < 99.5 else '.3g'}} % per step"

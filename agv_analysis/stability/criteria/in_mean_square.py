@@ -51,7 +51,7 @@ def _judge(facts: RunFacts) -> Judgement | None:
         return Judgement("Mean square", None, why, values, (growth, both))
     links = "" if both is None else " of both links"
     return Judgement(
-        "Mean square", growth < 0.0, f"E[e^2] times {math.exp(growth):.6g} a step under the fitted channel{links}",
+        "Mean square", growth < 0.0, f"{growth_text(growth)} under the fitted channel{links}",
         {"mean_square_stable": growth < 0.0, "mean_square_growth": finite(growth)}, (growth, both),
     )  # fmt: skip
 

@@ -20,7 +20,6 @@ from agv_analysis.stability.criteria.criterion import (
     Row,
     RunFacts,
     ScenarioFacts,
-    steps_text,
 )
 from agv_analysis.stability.derived_loop import is_kanayamas_law
 from agv_plant.vehicle.registry import UNICYCLE
@@ -85,7 +84,7 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
         reason = "no bound: the test holds for every n, since it sees an outdated pose only by how far it has turned"
         yield Margin(name, label, None, reason=reason)
     else:
-        yield Margin(name, label, n, steps_text(n, facts.scenario.plant.ts))
+        yield Margin(name, label, n, _tolerates(n))
 
 
 def _at_once(facts: RunFacts) -> Iterable[Row]:
@@ -98,7 +97,12 @@ def _at_once(facts: RunFacts) -> Iterable[Row]:
     if n is None:
         yield "Paper's test", "tolerates any number of consecutive outages"
     else:
-        yield "Paper's test", "fails even without outages" if n < 0 else f"tolerates up to {n} consecutive outages"
+        yield "Paper's test", _tolerates(n)
+
+
+def _tolerates(n: int) -> str:
+    """What the test says of a constant age of up to `n` slots."""
+    return "fails even without outages" if n < 0 else f"tolerates up to {n} consecutive outages"
 
 
 def _border(scenario: Scenario) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 from agv_analysis.json_values import finite
 from agv_analysis.run import Run
 from agv_analysis.stability import driven_motion, floquet, variable_delay
-from agv_analysis.stability.criteria.criterion import Criterion, Judgement, RunFacts, has_late
+from agv_analysis.stability.criteria.criterion import Criterion, Judgement, RunFacts, change_text, has_late
 
 
 def _judge(facts: RunFacts) -> Judgement | None:
@@ -23,8 +23,7 @@ def _judge(facts: RunFacts) -> Judgement | None:
 
 def _per_step(factor: float) -> str:
     """A growth factor per step in words."""
-    change = 100.0 * (factor - 1.0)
-    return f"{'grow' if change > 0.0 else 'shrink'} by {abs(change):.3g} % a step"
+    return f"{'grow' if factor > 1.0 else 'shrink'} by {change_text(factor - 1.0)}"
 
 
 def _contractions(facts: RunFacts) -> tuple[float | None, float | None]:

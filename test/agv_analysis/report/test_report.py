@@ -95,7 +95,7 @@ def test_all_plots_are_drawn_and_the_console_is_silent(shown: Chrome, lap: Analy
     for key in ("track", "time", "outages", "eigenvalues"):
         assert of_plot(shown, key, "plot.querySelectorAll('.main-svg').length") > 0
         assert of_plot(shown, key, "plot.getBoundingClientRect().height") > 300
-    assert "mean-square (by mean_square)" in shown.find_element("id", "figures").text
+    assert "mean-square (by mean square)" in shown.find_element("id", "figures").text
     # Where it strays most is marked on the track and over time, and stands in a table.
     worst = [peak.distance for peak in lap.deviation.worst]
     for key in ("track", "time"):
@@ -655,7 +655,7 @@ def test_margins_in_a_page_are_plain_text() -> None:
     """The terminal would take brackets for a colour; a page shows what escapes them."""
     lossy = [f"relay.{link}.{setting}" for link in ("uplink", "downlink") for setting in ("model=bernoulli", "p=0.1")]
     text = render(analyse(simulate(scenario_of(*lossy, "plant.duration=5.0"))))
-    assert "E[e^2] dies out, times" in text
+    assert "E[e^2] dies out, shrinks by" in text
     assert "E\\[" not in text
 
 

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from agv_analysis.cli import main
 from agv_analysis.metrics.confidence import clopper_pearson
-from agv_analysis.report.sweep_page import sweep_sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.sweep.axis_words import axis_words
@@ -30,6 +29,7 @@ from agv_analysis.sweep.plan import Part, Sweep, SweepError, parse_axis
 from agv_analysis.sweep.rows_file import write_rows
 from agv_analysis.sweep.store import Store
 from agv_analysis.sweep.summary import quantiles
+from agv_analysis.sweep.sweep_sentence import sweep_sentence
 from agv_analysis.sweep.verdicts import counted, with_verdicts
 from agv_ros.errors import UserError
 
@@ -296,6 +296,16 @@ def test_a_loop_that_does_not_settle_is_not_called_stable_by_the_headline() -> N
     assert sweep_sentence(rows) == "Of 2 points the loop is stable in every run at 1, and in none at 1."
     assert sweep_sentence(rows[1:]) == "The loop is stable in every run at all 1 points."
     assert "at 0" in sweep_sentence([rows[1] | {"verdict": "bounded"}])
+
+
+def test_a_sweep_over_one_axis_names_where_the_loop_is_stable_in_all_runs() -> None:
+    axis = parse_axis("controller.kx=5,100,500")
+    rows: Rows = [{axis.name: kx, "unstable": 0, "runs": 2} for kx in axis.values]
+    calm, bad = rows, [row | {"unstable": 2} for row in rows]
+    assert sweep_sentence([*calm[:2], bad[2]], axis) == "Stable in all runs for controller.kx <= 100 (2 of 3 points)."
+    assert "for controller.kx >= 100 (2 of 3" in sweep_sentence([bad[0], *calm[1:]], axis)
+    assert "for 100 <= controller.kx <= 100 (1 of 3" in sweep_sentence([bad[0], calm[1], bad[2]], axis)
+    assert "stable in every run at 2, and in none at 1" in sweep_sentence([calm[0], bad[1], calm[2]], axis)
 
 
 def test_workers_and_interruptions_change_nothing(tmp_path: Path) -> None:

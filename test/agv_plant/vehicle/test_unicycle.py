@@ -25,7 +25,7 @@ period = st.floats(1e-6, 0.2)
 @settings(deadline=None, derandomize=True)
 @given(place, place, angle, v, w, period)
 def test_euler_is_the_matrix_form_of_the_paper(x: float, y: float, theta: float, v: float, w: float, ts: float) -> None:
-    # Equations 19 and 20: X(k+1) = X(k) + T_s J(k) u(k).
+    # Equations 14 and 15: X(k+1) = X(k) + T_s J(k) u(k).
     J = np.array([[np.cos(theta), 0.0], [np.sin(theta), 0.0], [0.0, 1.0]])
     expected = np.array([x, y, theta]) + ts * (J @ np.array([v, w]))
     assert euler_step(x, y, theta, v, w, ts) == pytest.approx(tuple(expected), rel=1e-14, abs=1e-13)
