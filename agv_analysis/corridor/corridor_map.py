@@ -30,7 +30,10 @@ from agv_ros.errors import UserError
 
 N_ANY, P_HOUR = "n_any", "p_hour"
 
-TITLES = {N_ANY: "any outages up to n in the corridor", P_HOUR: "probability to leave in an hour"}
+TITLES = {
+    N_ANY: "longest outages in any order within the corridor",
+    P_HOUR: "probability to leave the corridor in an hour",
+}
 
 _HOUR = 3600.0
 

@@ -13,6 +13,7 @@ from typing import Any
 from agv_analysis.corridor.widths import widths_of
 from agv_analysis.explore.background_criteria import (
     SURE,
+    WHY,
     WORD,
     LatestOnlyWorker,
     WorkerDiedError,
@@ -142,7 +143,8 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     @app.callback(
         Output("lap", "children"), Output("lap", "className", allow_duplicate=True), Output("badge-word", "children"),
         Output("badge-word", "className", allow_duplicate=True), Output("badge-sure", "children"),
-        Input("problem", "children"), *states, State("pinned", "data"), prevent_initial_call=True,
+        Output("badge-why", "children"), Input("problem", "children"), *states, State("pinned", "data"),
+        prevent_initial_call=True,
     )  # fmt: skip
     def over_the_lap(_: Any, *given: Any) -> Any:  # after `move` has answered, so as not to keep it from that
         *settings, pinned = given
@@ -150,14 +152,15 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
             scenario = asked(values(tuple(settings)))
             found = criteria(scenario, None if pinned is None else asked(pinned))
         except UserError:  # `move` says why
-            return [], "", "…", "", ""
+            return [], "", "…", "", "", ""
         except WorkerDiedError:
-            return _table(dash.html, _DIED, False), "", "…", "", ""
+            return _table(dash.html, _DIED, False), "", "…", "", "", ""
         if found is None:
-            return _table(dash.html, _MOVED_ON, False), "", *[dash.no_update] * 3
+            return _table(dash.html, _MOVED_ON, False), "", *[dash.no_update] * 4
         rows = {name: value for name, value, _ in found}
         word = rows.get(WORD, "…")
-        return _table(dash.html, found, pinned is not None), "", word, word, rows.get(SURE, "")
+        why = f"Why: {rows[WHY]}." if WHY in rows else ""
+        return _table(dash.html, found, pinned is not None), "", word, word, rows.get(SURE, ""), why
 
     @app.callback(Output("tube", "data"), Input("lap", "children"), *states, prevent_initial_call=True)
     def find_tube(_: Any, *given: Any) -> Any:  # after the criteria

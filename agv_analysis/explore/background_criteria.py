@@ -26,7 +26,7 @@ _NICE = 19
 _MOST_MEMORY = 8 * 2**30
 """Most address space [B] of background computations, of which a part is memory."""
 
-WORD, SURE = "In a word", "How sure"
+WORD, SURE, WHY = "In a word", "How sure", "Because"
 """Rows that the badge shows, too."""
 
 _LAPS = 50
@@ -55,6 +55,7 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
     try:
         analysis = analyse(simulate(scenario))
         found = [("Verdict", sentence(analysis)), (WORD, analysis.verdict.word)]
+        found.append((WHY, analysis.verdict.reason))
         if analysis.evidence.confidence is not None:
             found.append((SURE, confidence_text(analysis.evidence.confidence)))
         if analysis.floquet is not None:

@@ -53,6 +53,7 @@ pre { white-space: pre-wrap }
 #badge .asymptotic, #badge .mean-square { color: var(--good) }
 #badge .unstable, #badge .infeasible { color: var(--bad) }
 #badge .bounded, #badge .undecided, #badge .unknown { color: var(--fair) } #badge .old { opacity: .4 }
+#badge-why { height: 2.8em; overflow: auto; font-size: .9rem; color: var(--soft); margin-top: .2rem }
 #pinned-name, #problem { height: 1.4em; overflow: auto; white-space: pre-wrap; font-size: .9rem; color: var(--soft) }
 #problem { color: var(--bad) }
 #lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
@@ -87,6 +88,7 @@ def layout(dash: Any, at_first: dict[str, Any], idle: Mapping[str, str]) -> Any:
             ],
             id="badge",
         ),
+        html.Div("", id="badge-why"),
         html.Div(
             [
                 html.Button("Pin this setting", id="pin"),

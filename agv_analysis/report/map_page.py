@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.corridor.corridor_map import N_ANY, P_HOUR, TITLES
+from agv_analysis.metrics.confidence import percent
 from agv_analysis.report.heat_map import colour_scale, heat_map_layout
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import plain
@@ -64,9 +66,18 @@ def map_sentence(found: MarginMap, scenario: Scenario) -> str:
     """What the map says at the point next to the scenario's own, in one sentence."""
     row = _nearest(found, scenario)
     i, j = divmod(row, len(found.second))
-    at = f"{found.labels[0]} = {number(found.first[i].item())}, {found.labels[1]} = {number(found.second[j].item())}"
+    values = zip(found.axes, (found.first[i].item(), found.second[j].item()), strict=True)
+    at = ", ".join(
+        f"{_symbol(scenario, axis)} = {number(value)} {axes_of(scenario)[axis][1]}" for axis, value in values
+    )
     said = (f"{title}: {_said(name, found.margins[name][i, j].item())}" for name, title in _shown(found))
-    return f"At {at}, {'; '.join(said)}."
+    return f"At {at}: {'; '.join(said)}."
+
+
+def _symbol(scenario: Scenario, axis: str) -> str:
+    """The letter of an axis, as `K_x`; its name where its meaning has none."""
+    found = re.search(r"\b[A-Z]\w*_\w+", axis_in_words(scenario, axis))
+    return found[0] if found else axis
 
 
 def axis_in_words(scenario: Scenario, axis: str) -> str:
@@ -89,7 +100,7 @@ def _shown(found: MarginMap) -> Iterator[tuple[str, str]]:
 
 def _said(name: str, value: float) -> str:
     if name == P_HOUR:
-        return f"{value:.3g}"
+        return percent(value)
     outside = "outside" if name == N_ANY else "unstable"
     return f"{outside} even without outages" if value < 0 else f"{value:g} slots"
 

@@ -82,7 +82,12 @@ def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
     if not rows:
         return
     calm = [row for row in rows if is_calm(row)]
-    yield Tile("stable", "Stable in every run", f"{len(calm)} of {len(rows)} points", "")
+    yield Tile(
+        "stable",
+        "Stable",
+        f"{len(calm)} of {len(rows)} points",
+        "in all runs" + " and by the verdict" * ("verdict" in rows[0]),
+    )
     if calm:
         best = best_point(rows)
         where = ", ".join(f"{axis.name} {number(best[axis.name])}" for axis in sweep.axes)

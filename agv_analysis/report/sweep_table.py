@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from agv_analysis.report.table import metres
+from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.plan import Sweep
 
 Row = dict[str, Any]
@@ -14,7 +15,10 @@ Row = dict[str, Any]
 
 def sweep_table(sweep: Sweep, rows: list[Row]) -> tuple[list[str], list[list[str]]]:
     """Heads, and the cells of each point, as text; the varied parameters first."""
-    columns = [*((axis.name, _value_of(axis.name)) for axis in sweep.axes), *_columns(sweep, rows[0] if rows else {})]
+    columns = [
+        *((axis_words(axis, sweep.base), _value_of(axis.name)) for axis in sweep.axes),
+        *_columns(sweep, rows[0] if rows else {}),
+    ]
     return [head for head, _ in columns], [[cell(row) for _, cell in columns] for row in rows]
 
 

@@ -17,14 +17,15 @@ def sweep_sentence(rows: Rows, *axes: Axis) -> str:
         return "No point of the sweep was run."
     short = sum(row.get("undecided", 0) > 0 for row in rows)
     calm = sum(is_calm(row) for row in rows)
+    sense = "in all runs and by the verdict" if "verdict" in rows[0] else "in all runs"
     bad = sum(row["unstable"] == row["runs"] for row in rows)
     if calm == len(rows):
-        return f"The loop is stable in every run at all {len(rows)} points."
+        return f"The loop is stable {sense} at all {len(rows)} points."
     too_short = f"; at {short} runs are too short to say" if short else ""
     where = _where(axes[0].name, rows) if calm and len(axes) == 1 else ""
     if where:
-        return f"Stable in all runs for {where} ({calm} of {len(rows)} points){too_short}."
-    return f"Of {len(rows)} points the loop is stable in every run at {calm}, and in none at {bad}{too_short}."
+        return f"Stable {sense} for {where} ({calm} of {len(rows)} points){too_short}."
+    return f"Of {len(rows)} points the loop is stable {sense} at {calm}, and in no run at {bad}{too_short}."
 
 
 def is_calm(row: dict[str, Any]) -> bool:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from agv_analysis.corridor.widths import widths_of
 from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.metrics.confidence import percent
+from agv_analysis.metrics.deviation import DIVERGED
 from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin
 from agv_analysis.watch.live_loop import POINTS, LiveLoop
 
@@ -81,8 +82,17 @@ def _seconds(loop: LiveLoop) -> str:
 
 
 def metres(value: float) -> str:
-    """A distance with a unit, to the millimetre."""
-    return "not known" if math.isnan(value) else f"{value:.3f} m"
+    """A distance with a unit: to the millimetre, of larger ones four digits."""
+    if math.isnan(value):
+        return "not known"
+    return "diverges" if value > DIVERGED else f"{_digits(value, 3)} m"
+
+
+def _digits(value: float, decimals: int) -> str:
+    """A number with so many decimals below ten, else with four digits."""
+    if abs(value) < 10.0:
+        return f"{value:.{decimals}f}"
+    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.2g}"
 
 
 def _corridor(loop: LiveLoop, largest: float) -> LiveTile:
@@ -97,7 +107,8 @@ def _corridor(loop: LiveLoop, largest: float) -> LiveTile:
     share = largest / widths.distance
     said = f"of it used in the last {_seconds(loop)}"
     if share > 1.0:
-        return LiveTile("corridor", "Corridor", f"{width}: left", f"{100.0 * share:.0f} % {said}", BAD)
+        used = f"{100.0 * share:.0f} %" if share < 10.0 else "more than ten times"
+        return LiveTile("corridor", "Corridor", f"{width}: left", f"{used} {said}", BAD)
     return LiveTile("corridor", "Corridor", f"{width}: kept", f"{100.0 * share:.0f} % {said}", GOOD)
 
 
@@ -133,13 +144,13 @@ def _speed(loop: LiveLoop) -> LiveTile:
     v, w = loop.latest("v"), loop.latest("w")
     if math.isnan(v):
         return LiveTile("speed", "Speed", "not known", "")
-    return LiveTile("speed", "Speed", f"{v:.2f} m/s", f"turning at {w:.2f} rad/s")
+    return LiveTile("speed", "Speed", f"{_digits(v, 2)} m/s", f"turning at {_digits(w, 2)} rad/s")
 
 
 def _deadlines(loop: LiveLoop, deadlines: dict[str, str]) -> LiveTile:
     missed, step = deadlines.get("missed deadlines"), deadlines.get("step", "0")
     if missed is not None:
-        note = f"of {step}; jitter p99 {float(deadlines.get('jitter p99 [s]', 'nan')) * 1e3:.2g} ms"
+        note = f"of {step}; jitter p99 {float(deadlines.get('jitter p99 [s]', 'nan')) * 1e3:.3g} ms"
         return LiveTile("deadlines", "Missed deadlines", missed, note, "" if missed == "0" else FAIR)
     if loop.scenario.plant.clock == "lockstep":
         return LiveTile("deadlines", "Missed deadlines", "none", "lockstep has no deadlines")

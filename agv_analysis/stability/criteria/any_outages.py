@@ -153,5 +153,5 @@ CRITERION = Criterion(
     margin_names=(("n_max.bursts", "Any outages up to n"),),
     at_once=_at_once,
     border=Border("any outages up to n", _border),
-    map_column=MapColumn("n_bursts", "largest repeated burst n", largest_repeated_bursts, _of_loop),
+    map_column=MapColumn("n_bursts", "longest outage that may repeat", largest_repeated_bursts, _of_loop),
 )

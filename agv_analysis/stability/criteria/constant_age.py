@@ -131,5 +131,5 @@ CRITERION = Criterion(
     margin_names=(("n_max.lifted", "Pose always n steps old"), ("delay_margin", "Delay margin, straight track")),
     at_once=_at_once,
     border=Border("pose always n steps old", _border),
-    map_column=MapColumn("n_lifted", "largest constant n", largest_delays, _of_loop),
+    map_column=MapColumn("n_lifted", "largest constant age of the pose", largest_delays, _of_loop),
 )

@@ -476,6 +476,7 @@ def test_the_badge_says_word_deviation_and_confidence_and_nothing_moves(page: Pa
     assert page.text("badge-deviation") == f"{analysis.deviation.largest:.3g} m"
     assert analysis.evidence.confidence is not None
     assert page.text("badge-sure") == confidence_text(analysis.evidence.confidence)
+    assert page.text("badge-why") == f"Why: {analysis.verdict.reason}."
     before = top()
     page.click("preset-missed")
     page.until(lambda: page.text("badge-deviation") == "diverges")

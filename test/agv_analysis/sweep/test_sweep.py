@@ -283,7 +283,7 @@ def test_runs_shorter_than_the_transient_do_not_make_a_stable_loop_unstable() ->
     assert np.isnan(stable["instability"])
     assert (stable["instability_low"], stable["instability_high"]) == (0.0, 1.0)
     assert unstable["verdict"] == "unstable"
-    assert "at 0, and in none at 0; at 2 runs are too short to say" in sweep_sentence([stable, unstable])
+    assert "at 0, and in no run at 0; at 2 runs are too short to say" in sweep_sentence([stable, unstable])
     assert counted([stable, unstable]) == "1 mean-square, 1 unstable"
 
 
@@ -293,8 +293,11 @@ def test_a_loop_that_does_not_settle_is_not_called_stable_by_the_headline() -> N
     rows = with_verdicts(sweep, rows_of(sweep))
     assert [row["verdict"] for row in rows] == ["infeasible", "asymptotic"]
     assert "falls behind its reference by 0.2 m/s" in rows[0]["verdict_reason"]
-    assert sweep_sentence(rows) == "Of 2 points the loop is stable in every run at 1, and in none at 1."
-    assert sweep_sentence(rows[1:]) == "The loop is stable in every run at all 1 points."
+    assert (
+        sweep_sentence(rows)
+        == "Of 2 points the loop is stable in all runs and by the verdict at 1, and in no run at 1."
+    )
+    assert sweep_sentence(rows[1:]) == "The loop is stable in all runs and by the verdict at all 1 points."
     assert "at 0" in sweep_sentence([rows[1] | {"verdict": "bounded"}])
 
 
@@ -305,7 +308,7 @@ def test_a_sweep_over_one_axis_names_where_the_loop_is_stable_in_all_runs() -> N
     assert sweep_sentence([*calm[:2], bad[2]], axis) == "Stable in all runs for controller.kx <= 100 (2 of 3 points)."
     assert "for controller.kx >= 100 (2 of 3" in sweep_sentence([bad[0], *calm[1:]], axis)
     assert "for 100 <= controller.kx <= 100 (1 of 3" in sweep_sentence([bad[0], calm[1], bad[2]], axis)
-    assert "stable in every run at 2, and in none at 1" in sweep_sentence([calm[0], bad[1], calm[2]], axis)
+    assert "stable in all runs at 2, and in no run at 1" in sweep_sentence([calm[0], bad[1], calm[2]], axis)
 
 
 def test_workers_and_interruptions_change_nothing(tmp_path: Path) -> None:
