@@ -45,7 +45,7 @@ def tables() -> Iterator[Table]:
     limit = "K_x = 25, n lost after each received pose: what a limit on |v| makes of it"
     yield Table("limit", limit, _limits(), 1, [f"{name}: {LARGEST}" for name in LIMITS])
     yield from policy_tables()
-    criteria = "Largest n that is stable, by criterion and by twins driven for a lap"
+    criteria = "Largest n [slots] that is stable, by criterion and by twins driven for a lap"
     compared = ["constant n", "constant n, twins", "bursts", "bursts, twins"]
     yield Table("criteria", criteria, _criteria(), 2, compared)
 

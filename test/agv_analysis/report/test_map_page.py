@@ -25,8 +25,7 @@ def test_a_map_has_a_page_with_points_to_click(
     show(chromium, page)
     assert complaints(chromium) == []
     sentence = chromium.find_element("id", "verdict").text
-    assert "kx [1/s] = 25, ts [s] = 0.005" in sentence
-    assert sentence.startswith("At K_x = 25 1/s, ")
+    assert sentence.startswith("At K_x = 25 1/s, T_s = 0.005 s: ")
     assert "longest outage that may repeat: 14 slots" in sentence
     titles = of_plot(chromium, "n_bursts", "[plot._fullLayout.xaxis.title.text, plot._fullLayout.yaxis.title.text]")
     assert titles == ["sampling period T_s [s]", "gain K_x of the error along the track [1/s]"]
