@@ -53,6 +53,9 @@ pre { white-space: pre-wrap }
 #badge .asymptotic, #badge .mean-square { color: var(--good) }
 #badge .unstable, #badge .infeasible { color: var(--bad) }
 #badge .bounded, #badge .undecided, #badge .unknown { color: var(--fair) } #badge .old { opacity: .4 }
+#plots { display: grid; grid-template-columns: minmax(0, 2fr) minmax(0, 3fr) }
+#plot-track, #plot-time { height: 620px }
+@media (max-width: 1200px) { #plots { display: block } #plot-track { height: 400px } }
 #badge-why { height: 2.8em; overflow: auto; font-size: .9rem; color: var(--soft); margin-top: .2rem }
 #pinned-name, #problem { height: 1.4em; overflow: auto; white-space: pre-wrap; font-size: .9rem; color: var(--soft) }
 #problem { color: var(--bad) }
@@ -67,6 +70,7 @@ pre { white-space: pre-wrap }
   }
   #drawer > summary { display: block; padding: .4rem 0; font-weight: 600; cursor: pointer }
   #controls { max-height: 45vh; overflow-y: auto }
+  #badge-why { height: 4.2em }
   #badge b { font-size: .95rem } #badge > div { padding: .2rem .4rem; font-size: .72rem } #badge { height: 6.4rem }
   th, td { padding-right: .4rem; font-size: .85rem } td { overflow-wrap: anywhere }
 }
@@ -99,8 +103,13 @@ def layout(dash: Any, at_first: dict[str, Any], idle: Mapping[str, str]) -> Any:
         ),
         html.Div("", id="pinned-name"),
         html.Div("", id="problem", role="alert"),
-        dcc.Graph(id="plot-track", style={"height": "400px"}, config={"displaylogo": False}),
-        dcc.Graph(id="plot-time", style={"height": "620px"}, config={"displaylogo": False}),
+        html.Div(
+            [
+                dcc.Graph(id="plot-track", config={"displaylogo": False}),
+                dcc.Graph(id="plot-time", config={"displaylogo": False}),
+            ],
+            id="plots",
+        ),
         html.Table([], id="summary"),
         html.H2("Over the whole lap"),
         html.Table([], id="lap"),

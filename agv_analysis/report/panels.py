@@ -215,7 +215,7 @@ def age(run: Run) -> Panel:
     if run.is_late:
         acted = run.command_age.astype(np.float64)
         lines.append(Line("by receive time, of the command that acted", run.time, acted, DRIVEN, STEP))
-    label = f"n_ul [{run.ts * 1e3:g} ms]"
+    label = "n_ul [steps]"
     title = "Age of information: steps since the freshest pose that the edge holds"
     is_fresh = not any(line.y.any() for line in lines)
     return Panel("age", title, TIME, label, tuple(lines), y_range=(-0.05, 1.0) if is_fresh else None)
