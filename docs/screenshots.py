@@ -48,7 +48,8 @@ def main() -> None:
             draw(chrome, page.as_uri(), name, DRAWN)
         with explorer("config/outages.yaml", "--corridor", "0.25") as address:
             draw(chrome, address, "explorer", EXPLORED)
-        with watched("config/outages.yaml", "--corridor", "0.25", "--clock", "realtime") as address:
+        limited = "controller.v_max=3.0"  # where a loaded machine misses deadlines, too, the AGV stays near its track
+        with watched("config/outages.yaml", "--corridor", "0.25", "--clock", "realtime", "--set", limited) as address:
             draw(chrome, address, "watch", WATCHED)
 
 

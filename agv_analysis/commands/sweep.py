@@ -202,7 +202,8 @@ def _headlines(sweep: Sweep, rows: list[dict[str, Any]]) -> Iterator[tuple[str, 
         return
     best = best_point(rows)
     where = ", ".join(f"{axis.name} {_plain(best[axis.name])}" for axis in sweep.axes)
-    yield "Deviation", f"at most {metres(best['deviation_max_p50'])} at {where}, the best point (median of the runs)"
+    largest = metres(best["deviation_max_p50"])
+    yield "Deviation", f"largest {largest} at {where}, the best point (median of the runs)"
     sure = 100.0 * max(row["instability_high"] for row in calm)
     yield "Confidence", f"at the stable points below {sure:.3g} % of all runs unstable (95 %)"
 

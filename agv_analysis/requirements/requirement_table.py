@@ -76,7 +76,7 @@ def rows_of_link(found: LinkAvailability) -> Iterator[Row]:
 
 def _estimate(found: Estimate, unit: str = "") -> str:
     def text(value: float) -> str:
-        return f"{value:.5g}{unit}" if math.isfinite(value) else "no end"
+        return f"{value:.4g}{unit}" if math.isfinite(value) else "no end"
 
     if math.isinf(found.value) and math.isinf(found.low):
         return "no failure"
@@ -85,10 +85,12 @@ def _estimate(found: Estimate, unit: str = "") -> str:
 
 
 def _share(found: Estimate) -> str:
-    """A share close to 1, with as many nines as it has."""
+    """A share close to 1, with as many nines as it has, and three digits of what is missing."""
 
     def text(value: float) -> str:
-        return f"{100.0 * value:.10g} %"
+        missing = 100.0 * (1.0 - value)
+        digits = 2 - math.floor(math.log10(missing)) if missing > 0.0 else 0
+        return f"{100.0 - missing:.{min(10, max(0, digits))}f} %"
 
     return text(found.value) + ("" if found.low == found.high else f" ({text(found.low)} to {text(found.high)})")
 
