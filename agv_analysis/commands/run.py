@@ -209,6 +209,10 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     console.print(table)
     if found.judged:
         console.print(
+            "Twins: how far apart two AGVs end that begin a micrometre apart and meet the losses of this run, as a "
+            "multiple of that."
+        )
+        console.print(
             f"Unstable: {found.unstable} of {found.judged} AGVs, {found.fraction:.1%} "
             f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
         )

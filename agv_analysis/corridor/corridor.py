@@ -19,6 +19,7 @@ from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.metrics.confidence import percent
+from agv_analysis.metrics.duration_text import duration_text
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
@@ -325,19 +326,10 @@ def _time(mean: Estimate | None) -> str:
     if mean is None:
         return "it never leaves"
     if not math.isfinite(mean.value):
-        return f"more than {_seconds(mean.low)}"
+        return f"more than {duration_text(mean.low)}"
     if mean.low == mean.high:
-        return _seconds(mean.value)
-    return f"{_seconds(mean.value)} ({_seconds(mean.low)} .. {_seconds(mean.high)})"
-
-
-_UNITS = ((3.156e7, "years"), (86400.0, "days"), (3600.0, "h"), (60.0, "min"))
-
-
-def _seconds(value: float) -> str:
-    if math.isinf(value):
-        return "any time"
-    return next((f"{value / size:.3g} {unit}" for size, unit in _UNITS if value >= 2.0 * size), f"{value:.3g} s")
+        return duration_text(mean.value)
+    return f"{duration_text(mean.value)} ({duration_text(mean.low)} .. {duration_text(mean.high)})"
 
 
 def _estimates(name: str, found: Estimate | None) -> dict[str, Any]:

@@ -18,7 +18,10 @@ from agv_analysis.stability.derived_loop import linear_loop
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.first_border import borders
 from agv_analysis.stability.lifted import largest_radius
+from agv_cloud.parameters import ErrorDetectorParameters
 from agv_plant.radio.delay import whole_slots
+from agv_ros.errors import UserError
+from agv_ros.parameters import parameters_of
 
 _GRID = (0.1, 0.3, 0.6, 1.0, 1.5, 2.2, 4.0, 10.0)
 """Gains that are tried first, over those of a loop with the time constant of dead time, lag and period."""
@@ -66,10 +69,17 @@ def plant_like(robot: IdentifiedRobot, has_upper_ends: bool = False) -> Scenario
     """A scenario whose plant behaves like the robot; None unless v and w are known.
 
     `has_upper_ends`: with the longest dead time, lag and the largest gain of their intervals, else with the estimates.
+    Raises UserError if the robot was driven faster than a reference may be.
     """
     v, w = (robot[key].fit for key in "vw")
     if v is None or w is None:
         return None
+    fastest = parameters_of(ErrorDetectorParameters)["speed"].high
+    if fastest is not None and robot.largest_speed > fastest:
+        raise UserError(
+            f"the robot was driven at up to {robot.largest_speed:g} m/s, and gains are found for at most {fastest:g} "
+            "m/s: record it at the speeds at which it works"
+        )
     dead_time, lag, gain = (
         max(getattr(part, "high" if has_upper_ends else "value") for part in parts)
         for parts in ((v.dead_time, w.dead_time), (v.lag, w.lag), (v.gain,))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 
 from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.metrics.duration_text import duration_text
 from agv_analysis.requirements.availability import packets_for
 from agv_analysis.requirements.link_availability import LinkAvailability
 from agv_analysis.requirements.loop_requirements import LoopRequirements
@@ -82,10 +83,10 @@ def _at_most(name: str, seen: Estimate, limit: float, link: LinkAvailability) ->
 
 
 def _at_least(seen: Estimate, limit: float, link: LinkAvailability) -> Answer:
-    said = f"mean time between failures {seen.value:.4g} s" if math.isfinite(seen.value) else "no failure"
-    upto = f"{seen.high:.4g} s" if math.isfinite(seen.high) else "no end"
-    said += f" ({seen.low:.4g} s to {upto})" if seen.low < seen.high else ""
-    said += f", at least {limit:.4g} s"
+    said = f"mean time between failures {duration_text(seen.value)}" if math.isfinite(seen.value) else "no failure"
+    upto = duration_text(seen.high) if math.isfinite(seen.high) else "no end"
+    said += f" ({duration_text(seen.low)} to {upto})" if seen.low < seen.high else ""
+    said += f", at least {duration_text(limit)}"
     if seen.low >= limit or seen.high < limit:
         return (YES if seen.low >= limit else NO), said
     # A share h of the packets that fail makes a mean time of interval (1 - h) / h between failures.

@@ -235,3 +235,11 @@ def test_command_reads_a_robots_bag(agv_ncs: AgvNcs, tmp_path: Path) -> None:
     status, said = agv_ncs("identify", tmp_path / "robot", "--pose-topic", "/odom")
     assert status == 1
     assert "no topic /agv/cmd_vel for the command" in said
+
+
+def test_a_robot_that_is_driven_faster_than_any_reference_is_refused_in_a_line(agv_ncs: AgvNcs) -> None:
+    """The sample begins 5 m off its track, and is commanded 124.5 m/s."""
+    status, said = agv_ncs("identify", str(Path(__file__).parents[3] / "bags/sample"))
+    assert status == 1
+    assert "driven at up to 124.5 m/s" in said
+    assert "at most 100 m/s" in said
