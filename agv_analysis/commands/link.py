@@ -140,7 +140,7 @@ def _rates(console: Console, found: LossRates) -> dict[str, Any]:
     rate = rate_of(found)
     console.print(
         f"[bold]{found.source}[/]: {found.format}, {int(found.packets.sum())} packets in {len(found.packets)} "
-        f"intervals, {rate.value:.4%} lost (95 %: {rate.low:.4%} to {rate.high:.4%})",
+        f"intervals, {_percent(rate.value)} lost (95 %: {_percent(rate.low)} to {_percent(rate.high)})",
         soft_wrap=True,
     )
     for note in found.notes:
@@ -259,7 +259,11 @@ def _rate(direction: DirectionFigures) -> str:
     rate = direction.loss_rate
     if rate is None:
         return "-"
-    return f"{rate.value:.4%} ({rate.low:.4%} to {rate.high:.4%})"
+    return f"{_percent(rate.value)} ({_percent(rate.low)} to {_percent(rate.high)})"
+
+
+def _percent(rate: float) -> str:
+    return f"{100.0 * rate:.3g} %"
 
 
 def _ms(seconds: float) -> str:

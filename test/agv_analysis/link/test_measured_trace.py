@@ -206,7 +206,7 @@ def test_what_a_file_cannot_say_is_said_in_a_line(tmp_path: Path, agv_ncs: AgvNc
     path.write_text(json.dumps({"start": {"version": "iperf 3.16"}, "intervals": [{"sum": one}]}))
     status, said = agv_ncs("link", path)
     assert status == 0
-    assert "0.5000% lost" in said
+    assert "0.5 % lost" in said
     status, said = agv_ncs("link", path, "--trace", tmp_path / "t.csv")
     assert status == 1
     assert "a loss rate, but no trace to drive a loop with" in said.splitlines()[-1]
