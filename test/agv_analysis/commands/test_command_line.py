@@ -53,7 +53,7 @@ def test_run_and_analyse(agv_ncs: AgvNcs, tmp_path: Path) -> None:
         "lifted_stable", "bursts_stable",
     } <= found.keys()  # fmt: skip
     assert (found["steps"], found["seed"], found["valid"]) == (400, 3, True)
-    assert f"{found['loss_rate']:.2%} lost" in said
+    assert f"{100.0 * found['loss_rate']:.3g} % lost" in said
     assert str(bag) in said
     picture = Path(re.search(r"picture: (\S+)", said)[1])  # type: ignore[index]
     assert picture.read_bytes().startswith(b"\x89PNG")
