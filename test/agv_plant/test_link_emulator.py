@@ -82,12 +82,13 @@ class Radio:
         """What comes, serialised; once the emulator publishes it to this subscription."""
         found: list[bytes] = []
         where = on or self.edge
-        where.create_subscription(kind, topic, found.append, qos, raw=True)
+        subscription = where.create_subscription(kind, topic, found.append, qos, raw=True)
         name = where.resolve_topic_name(topic)
 
         def is_connected() -> bool:
             publishers = [one for node in (self.emulator, *self.emulator.sides) for one in node.publishers]
-            return any(one.topic_name == name and one.get_subscription_count() for one in publishers)
+            is_known = any(one.topic_name == name and one.get_subscription_count() for one in publishers)
+            return is_known and subscription.get_publisher_count() > 0  # each of the other
 
         self.until(is_connected)
         return found
