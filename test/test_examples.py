@@ -58,8 +58,6 @@ def test_an_example_writes_what_it_says(name: str, without_ros: Code, tmp_path: 
     assert {path.name for path in tmp_path.iterdir()} == WRITTEN[name]
     for file in map(tmp_path.joinpath, WRITTEN[name]):
         assert file.is_dir() or file.stat().st_size > 0
-    if name == "sweep_to_figure":  # with threads, and the same every time
-        assert run(without_ros, name, tmp_path) == said
     for file in tmp_path.glob("*.json"):
         assert json.loads(file.read_text(encoding="utf-8"))["steps"] > 0
     if name == "own_channel":

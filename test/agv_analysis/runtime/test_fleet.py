@@ -228,13 +228,13 @@ def test_the_command_says_how_each_fared(agv_ncs: AgvNcs, tmp_path: Path, how: t
     bag = tmp_path / "fleet"
     settings = [word for setting in (*SHARED, "controller.kx=5.0") for word in ("--set", setting)]
     status, said = agv_ncs(
-        "run", PAPER, *settings, "--fleet", 2, "--pitch", 3.0, "--duration", 20.0, "--bag", bag, *how
+        "run", PAPER, *settings, "--fleet", 2, "--pitch", 3.0, "--duration", 10.0, "--bag", bag, *how
     )
     assert status == 0, said[-2000:]
     rows = list(csv.DictReader((bag / "fleet.csv").open()))
     content = json.loads((bag / "fleet.json").read_text())
     assert [row["vehicle"] for row in rows] == ["agv_01", "agv_02"]
-    assert [row["steps"] for row in content["vehicles"]] == [4000, 4000]
+    assert [row["steps"] for row in content["vehicles"]] == [2000, 2000]
     assert (content["unstable"], content["judged"], content["fraction"]) == (0, 2, 0.0)
     assert "Unstable: 0 of 2 AGVs, 0.0% (0.0% .. 84.2% with 95% confidence)" in said
     assert (read_run(bag / "agv_02").scenario.error_detector.track_start[0]) == -3.0
