@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PIP ?= $(BIN)/python -m pip --disable-pip-version-check
 DEMO := bags/demo
 PROSE := README.md CONTRIBUTING.md SECURITY.md QUALITY_DECLARATION.md CHANGELOG.md $(filter-out docs/style.md,$(wildcard docs/*.md))
 
@@ -73,13 +74,13 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(if $(HAVE_ROS),--system-site-packages) $(VENV)
 
 $(VENV)/run.stamp: $(VENV)/bin/python setup.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all$(if $(HAVE_ROS),,$(comma)ros)]'
+	$(PIP) install --quiet --editable '.[all$(if $(HAVE_ROS),,$(comma)ros)]'
 	touch $@
 
 $(VENV)/test.stamp: $(VENV)/bin/python setup.py
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test$(if $(HAVE_ROS),,$(comma)ros)]'
+	$(PIP) install --quiet --editable '.[test$(if $(HAVE_ROS),,$(comma)ros)]'
 	touch $@ $(VENV)/run.stamp
 
 $(VENV)/site.stamp: $(VENV)/run.stamp
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[site]'
+	$(PIP) install --quiet --editable '.[site]'
 	touch $@
