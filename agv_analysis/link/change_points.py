@@ -5,6 +5,8 @@ largest at the most likely change. How large it gets by itself on a link that do
 maximum over t has no chi-square distribution, its limit (a Bessel bridge) is far off where outages are few, and lengths
 that are not geometric scatter more. So it is compared with that of the same recording, cut into blocks much longer than
 an outage, in random order: whatever the link, as long as it does not change these are as likely as the one observed.
+Where losses come more regularly than by chance, as every hundredth packet, all orders are nearly the same, and any is
+the largest by a hair. So the p-value is never below that of the likelihood ratio of a change at a known step, e^-gain.
 
 Segments are split anew as long as there is such a change (binary segmentation). One outage is no change of the link:
 the part that loses more must hold at least three.
@@ -15,6 +17,7 @@ in Change Point Analysis, Stat. Prob. Letters 53, 2001.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -57,7 +60,8 @@ class Stationarity:
     """Is the link the same all along?"""
 
     p_value: float | None
-    """Share of random orders with as large a likelihood ratio; None if the recording is too short for its outages."""
+    """Share of random orders with as large a likelihood ratio, or e^-gain if that is more; None if the recording is too
+    short for its outages."""
     change_points: tuple[int, ...]
     """First step k of each segment but the first."""
     segments: tuple[Segment, ...]
@@ -101,7 +105,8 @@ def _most_likely_change(k: Steps, lost: Outcomes, segment: Segment) -> tuple[flo
     near = np.arange(edges[best] + 1, edges[best + 2])
     counts = before[:, best, None] - blocks[:, best, None] + _transitions_before(k[around], lost[around])[:, 1:-1]
     exact = _gains(np.concatenate((counts, before[:, -1:]), axis=1))
-    return float(1 + reached) / (ORDERS + 1), segment.begin + int(near[np.argmax(exact)]) + 1
+    p_value = max(float(1 + reached) / (ORDERS + 1), math.exp(-float(observed.max())))
+    return p_value, segment.begin + int(near[np.argmax(exact)]) + 1
 
 
 def _block_length(k: Steps, lost: Outcomes) -> int:

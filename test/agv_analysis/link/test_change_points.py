@@ -64,3 +64,13 @@ def test_recordings_too_short_to_change(slots: int) -> None:
 def test_a_short_recording_without_any_outage_shows_no_change(slots: int) -> None:
     found = stationarity(np.arange(slots), np.zeros(slots, dtype=np.bool_))
     assert (found.p_value, found.change_points) == (1.0, ())
+
+
+@pytest.mark.parametrize("every", [10, 100])
+def test_losses_that_come_like_clockwork_are_no_change(every: int) -> None:
+    """All orders of its blocks are nearly the same; the first one, which begins without a loss, is the odd one out."""
+    k = np.arange(100_000)
+    found = stationarity(k, k % every == 7)
+    assert found.change_points == ()
+    assert found.p_value is not None
+    assert found.p_value > 0.1
