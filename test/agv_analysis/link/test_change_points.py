@@ -67,7 +67,7 @@ def test_a_short_recording_without_any_outage_shows_no_change(slots: int) -> Non
 
 
 @pytest.mark.parametrize("every", [10, 100])
-def test_losses_that_come_like_clockwork_are_no_change(every: int) -> None:
+def test_losses_at_equal_intervals_are_no_change(every: int) -> None:
     """All orders of its blocks are nearly the same; the first one, which begins without a loss, is the odd one out."""
     k = np.arange(100_000)
     found = stationarity(k, k % every == 7)
