@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 
 @contextlib.contextmanager
@@ -16,7 +14,8 @@ def one_process_at_a_time(folder: Path) -> Iterator[None]:
     Where there are no such locks, as on Windows and some network file systems, nothing is held.
     """
     try:
-        fcntl: Any = importlib.import_module("fcntl")
+        import fcntl
+
         file = (folder / "lock").open("w")
     except (ImportError, OSError):
         yield

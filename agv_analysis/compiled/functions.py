@@ -81,7 +81,7 @@ def _over_lanes() -> _Way:
     vars(module).update({name: value for name, value in vars(math).items() if not name.startswith("__")})
     for name, function in (("sin", sine), ("cos", cosine)):
         setattr(module, name, _inlined(function, {}, made, _PLAINLY))
-    return _Way({"error_model": "numpy"}, {"math": module})
+    return _Way({"error_model": "numpy"}, {"math": module}, {})
 
 
 @functools.cache
@@ -107,12 +107,11 @@ class _Way(NamedTuple):
 
     options: Mapping[str, Any]
     modules: Mapping[str, types.ModuleType]
+    inlined: dict[tuple[tuple[Function, Function], ...], dict[Function, Any]]
+    """What has been compiled to be put inside callers, by replacements: for all functions that call it."""
 
 
-_PLAINLY = _Way({}, {})
-
-_INLINED: dict[tuple[tuple[tuple[Function, Function], ...], int], dict[Function, Any]] = {}
-"""What has been compiled to be put inside callers, by replacements and way: for all functions that call it."""
+_PLAINLY = _Way({}, {}, {})
 
 
 def _compile(
@@ -123,7 +122,7 @@ def _compile(
 
     if folder is not None and not any(folder.glob("*.nbi")):  # numba's index of what is there
         LOG.info("%s is compiled, and kept in %s", function.__qualname__, folder)
-    made = _INLINED.setdefault((tuple(replacements.items()), id(way)), {})
+    made = way.inlined.setdefault(tuple(replacements.items()), {})
     copy = with_globals(function, _compiled_calls(function, replacements, made, way))
     # Looked at by the decorator, not later. An older numba has no such locators, and compiles for each place anew.
     wanted = {"CACHE_DIR": str(folder or ""), "CACHE_LOCATOR_CLASSES": _LOCATOR}

@@ -229,29 +229,25 @@ def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Fl
     limit = _FARTHER * min(widths.distance, max(widths.along, widths.across))
     bounds = np.empty((lap, len(template.directions)))
     begins = (0, lap // 2 // apart * apart) if lap >= 2 * max(warm_up, n + 2) else (0,)
-    parts = tuple(zip(begins, np.split(bounds, begins[1:]), strict=True))
     drive = compiled(_push, of_size_3(linear.F, linear.G))
     matrices = linear.F, linear.G, linear.H, linear.K
     arguments = *matrices, bias.rows, bias.every, rows, remainder, template.directions, template.lever, apart
 
-    def warmed_up(begin: int, _: Floats) -> Floats | None:
-        window = np.zeros((n + 2, len(template.directions)))
-        begun = np.empty((warm_up, len(template.directions)))
-        return window if drive(*arguments, (begin - warm_up) % rows, window, begun, limit) else None
+    def drive_from(begin: int, window: Floats, of_steps: Floats) -> bool:
+        return bool(drive(*arguments, begin % rows, window, of_steps, limit))
 
-    def driven(begin: int, of_part: Floats, window: Floats) -> Floats | None:
-        return window if drive(*arguments, begin % rows, window, of_part, limit) else None
-
-    with ThreadPoolExecutor(len(parts)) as pool:
-        windows = [*pool.map(warmed_up, *zip(*parts, strict=True))]
+    windows = np.zeros((len(begins), n + 2, len(template.directions)))
+    with ThreadPoolExecutor(len(begins)) as pool:
+        earlier = [begin - warm_up for begin in begins]
+        if not all(pool.map(drive_from, earlier, windows, np.empty((len(begins), warm_up, bounds.shape[1])))):
+            return None
         for _ in range(_LAPS):
-            if any(window is None for window in windows):
+            windows += _SLACK * np.where(np.isfinite(windows), np.abs(windows) + 1e-6, 0.0)
+            before = windows.copy()
+            if not all(pool.map(drive_from, begins, windows, np.split(bounds, begins[1:]))):
                 return None
-            known = [window for window in windows if window is not None]
-            before = [window + _SLACK * np.where(np.isfinite(window), np.abs(window) + 1e-6, 0.0) for window in known]
-            ends = [*pool.map(driven, *zip(*parts, strict=True), [window.copy() for window in before])]
-            windows = [ends[-1], *ends[:-1]]  # each part goes on where the one before it has ended
-            if all(end is not None and (end <= begin).all() for end, begin in zip(windows, before, strict=True)):
+            windows = np.roll(windows, 1, axis=0)  # each part goes on where the one before it has ended
+            if (windows <= before).all():
                 of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)[::apart]
                 nominal = bias.nominal[::apart]
                 return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
