@@ -80,10 +80,8 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
         progress(plant.steps)
     ended = [node for node in nodes.values() if node.is_ending()]
     halted = [node for node in nodes.values() if node.is_halted()]
-    is_cut_off = halted or any(node.killed_by for node in ended)
-    if not is_cut_off:
-        _end_upstream_first(nodes, stop)
-    _end(nodes, stop, _SHORT_TIMEOUT if is_cut_off else _STOP_TIMEOUT)
+    is_cut_off = bool(halted) or any(node.killed_by for node in ended)
+    _end(nodes, stop, _SHORT_TIMEOUT if is_cut_off else _STOP_TIMEOUT, in_order=not is_cut_off)
     progress(plant.steps)
     recording = recorder.last_line() if recorder else ""
     failed = recorder is not None and recorder.status != 0
@@ -104,16 +102,15 @@ def _failure(plant: _Process, ended: Sequence[_Process], halted: Sequence[_Proce
     return "; ".join([*said, *(f"{node.name} is halted by a signal" for node in halted)])
 
 
-def _end_upstream_first(nodes: Mapping[str, _Process], stop: Stop) -> None:
-    """End the nodes in the order of the loop, so that each answers what the one before it has sent."""
-    for name in SCHEMAS:
-        _end_all([nodes[name]], stop, _STOP_TIMEOUT)
+def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float, in_order: bool = False) -> None:
+    """End all nodes, the recorder, which has to hear of the others' end, last.
 
-
-def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float) -> None:
-    """End all nodes, the recorder, which has to hear of the others' end, last."""
-    _end_all([node for name, node in nodes.items() if name != "recorder"], stop, patience)
-    _end_all([node for name, node in nodes.items() if name == "recorder"], stop, patience)
+    `in_order`: one after the other as in the loop, so that each answers what the one before it has sent.
+    """
+    loop = [nodes[name] for name in SCHEMAS if name in nodes]
+    for together in [[node] for node in loop] if in_order else [loop]:
+        _end_all(together, stop, patience)
+    _end_all([nodes[name] for name in nodes if name not in SCHEMAS], stop, patience)
 
 
 def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None:
