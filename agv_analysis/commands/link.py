@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,18 +10,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import OUTPUT, corridor_settings, with_force, write_json
+from agv_analysis.commands.link_file import FileOptions, read_link_file, with_link_file
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from typing_extensions import Unpack
 
-    from agv_analysis.link.formats.format import Options
     from agv_analysis.link.link_figures import DirectionFigures, LinkFigures, Spread
-    from agv_analysis.link.measurement import LossRates, Measurement, Reading, Setting
+    from agv_analysis.link.measurement import LossRates, Measurement, Setting
     from agv_analysis.scenario import Scenario
     from agv_analysis.stability.through_link import ThroughLink
-
-_LONG = 2**25
-"""Files of more bytes than this are read under a progress bar."""
 
 
 @click.command("link")
@@ -30,14 +27,7 @@ _LONG = 2**25
 @click.argument("params", type=click.Path(), required=False)
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter of PARAMS.")
 @click.option("--corridor", type=click.FloatRange(min=0.0, min_open=True), help="How often is it further off [m]?")
-@click.option("--format", "name", help="The format of FILE, if it cannot be told by what is in it.")
-@click.option(
-    "--interval", type=click.FloatRange(min=0.0, min_open=True), help="Time between packets [s] where FILE has none."
-)
-@click.option("--column", "columns", multiple=True, metavar="ROLE=NAME", help="Which column of a table is what.")
-@click.option("--delimiter", default="", metavar="CHARACTER", help="Between the cells of a table; or tab, space.")
-@click.option("--topic", default="", help="Which topic of a bag.")
-@click.option("--received", type=click.Path(path_type=Path), help="The capture at the other end, beside FILE.")
+@with_link_file
 @click.option(
     "--rtt", type=click.Choice(["up", "half", "down"]), default="up", show_default=True,
     help="Where only round trips are known: on which way packets and time were lost.",
@@ -47,9 +37,8 @@ _LONG = 2**25
 @click.option("--json", "json_file", type=OUTPUT, help="Write the figures to this file, too.")
 @with_force
 def command(
-    file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, name: str | None,
-    interval: float | None, columns: tuple[str, ...], delimiter: str, topic: str, received: Path | None, rtt: str,
-    trace: Path | None, picture: Path | None, json_file: Path | None,
+    file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, rtt: str, trace: Path | None,
+    picture: Path | None, json_file: Path | None, **said: Unpack[FileOptions],
 ) -> None:  # fmt: skip
     """Show what FILE says of a link: output of ping, irtt, owping, iperf3, a capture, a table, a bag, a line for netem.
 
@@ -64,15 +53,13 @@ def command(
     """
     from rich.console import Console
 
-    from agv_analysis.link.formats.format import Options
     from agv_analysis.link.measurement import LossRates, Setting
     from agv_analysis.scenario import load_scenario
 
     if params is None and (settings or corridor is not None):
         raise click.UsageError("--set and --corridor are about the loop of a params file: give PARAMS behind FILE")
     scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
-    options = Options(interval, dict(map(_column, columns)), delimiter, topic, received)
-    reading = read_file(file, options, name or "")
+    reading = read_link_file(file, said)
     console = Console(highlight=False)
     if isinstance(reading, Setting):
         found = _setting(console, reading, scenario)
@@ -86,30 +73,6 @@ def command(
         raise click.ClickException(reading.refusal)
     if isinstance(reading, Setting) and (trace is not None or picture is not None):
         raise click.ClickException(f"{reading.source}: {reading.line!r} is a setting, of which there is no measurement")
-
-
-def _column(text: str) -> tuple[str, str]:
-    role, equals, name = text.partition("=")
-    if not equals:
-        raise click.ClickException(f"--column takes ROLE=NAME, as in time=frame.time_epoch; got {text!r}")
-    return role, name
-
-
-def read_file(file: Path, options: Options, name: str = "") -> Reading:
-    """Read a measured link, a long file under a progress bar. Raises MeasurementError for one that is none."""
-    from agv_analysis.commands.progress import step_bar
-    from agv_analysis.link.formats import read_link
-    from agv_analysis.link.formats.netem_line import setting
-    from agv_analysis.link.netem_text import is_netem
-
-    if is_netem(str(file)) and not os.path.exists(file):  # noqa: PTH110  # Path.exists minds what is too long for a name
-        return setting(str(file), "the command line")
-    if not file.is_file() or file.stat().st_size < _LONG:
-        return read_link(file, options, name)
-    from dataclasses import replace
-
-    with step_bar(100, "reading") as progress:
-        return read_link(file, replace(options, progress=lambda share: progress(round(100 * share))), name)
 
 
 def _setting(console: Console, found: Setting, scenario: Scenario | None) -> dict[str, Any]:

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import OUTPUT, corridor_settings, with_force, with_settings, write_json
+from agv_analysis.commands.link_file import FileOptions, read_link_file, refuse_without_file, with_link_file
 from agv_analysis.output_file import MARKDOWN_MARK, output_file
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from agv_analysis.requirements.link_availability import LinkAvailability
     from agv_analysis.requirements.loop_requirements import LoopRequirements
     from agv_analysis.requirements.offered_service import OfferedService
@@ -24,11 +27,7 @@ if TYPE_CHECKING:
 @click.option("--corridor", type=click.FloatRange(min=0.0, min_open=True), help="Stay within so much [m] as well.")
 @click.option("--corridor-along", type=click.FloatRange(min=0.0, min_open=True), help="So much [m] along the track.")
 @click.option("--link", "file", type=click.Path(path_type=Path), help="A measured link, as `agv-ncs link` reads it.")
-@click.option(
-    "--interval",
-    type=click.FloatRange(min=0.0, min_open=True),
-    help="Time between its packets [s], if not in the file.",
-)
+@with_link_file
 @click.option("--class", "name", help="A class of service: is it met, would it do, and what does the loop do on it?")
 @click.option("--classes", "files", multiple=True, type=click.Path(path_type=Path), help="A file with more classes.")
 @click.option(
@@ -46,9 +45,9 @@ if TYPE_CHECKING:
 @with_force
 def command(
     params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
-    interval: float | None, name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
+    name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
     survival_time: float | None, transfer_interval: float | None, latency: float | None, table: Path | None,
-    report: Path | None, json_file: Path | None,
+    report: Path | None, json_file: Path | None, **said: Unpack[FileOptions],
 ) -> None:  # fmt: skip
     """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
 
@@ -82,6 +81,8 @@ def command(
         raise UserError(
             "--transfer-interval is offered with a --survival-time, --availability, --mtbf or --class: give one"
         )
+    if file is None:
+        refuse_without_file(said)
     scenario = load_scenario(params, (*settings, *corridor_settings(corridor, corridor_along)))
     classes = load_classes(*files)
     if name is not None:
@@ -93,7 +94,7 @@ def command(
     console = Console(highlight=False)
     with Console(stderr=True).status("computing what the loop asks ..."):
         loop = require(scenario)
-    link = _link_of(scenario, loop, file, interval)  # which may have a progress bar of its own
+    link = _link_of(scenario, loop, file, said)  # which may have a progress bar of its own
     enough = {one.name: would_do(one, loop) for one in classes}
     met = {one.name: meets(one, link) for one in classes}
     sections: dict[str, list[tuple[str, ...]]] = {"What the loop asks of its radio": list(rows_of_loop(loop))}
@@ -142,11 +143,9 @@ def _asked(availability: float | None, mtbf: float | None) -> ServiceClass:
 
 
 def _link_of(
-    scenario: Scenario, loop: LoopRequirements, file: Path | None, interval: float | None
+    scenario: Scenario, loop: LoopRequirements, file: Path | None, said: FileOptions
 ) -> LinkAvailability | None:
     """What the measured link gives, or the scenario's uplink; None where nothing is known of it, or of the loop."""
-    from agv_analysis.commands.link import read_file
-    from agv_analysis.link.formats.format import Options
     from agv_analysis.link.link_figures import LinkFigures
     from agv_analysis.link.markov_channel import chain_of
     from agv_analysis.link.measured_trace import of_trace
@@ -157,7 +156,7 @@ def _link_of(
     slots = loop.survival_slots
     uplink = scenario.relay.uplink
     if file is not None:
-        reading = read_file(file, Options(interval))
+        reading = read_link_file(file, said)
         if isinstance(reading, LossRates):
             raise UserError(reading.refusal)
         if isinstance(reading, Measurement):

@@ -297,3 +297,22 @@ def test_a_class_is_what_is_offered(tmp_path: Path) -> None:
     assert offered["channel"]["loss_rate"] == pytest.approx(1e-4)
     answer = CliRunner().invoke(main, ["require", params, "--transfer-interval", "0.01"])
     assert (answer.exit_code, "is offered with a --survival-time, --availability" in answer.output) == (1, True)
+
+
+def test_a_table_is_read_as_the_options_say(tmp_path: Path, agv_ncs: AgvNcs) -> None:
+    """Of 4000 packets, 20 ms apart, every 40th is lost: an outage of 20 ms, which the loop survives."""
+    table, found = tmp_path / "table.txt", tmp_path / "found.json"
+    table.write_text("n when gone\n" + "".join(f"{i} {0.02 * i:.2f} {int(i % 40 == 7)}\n" for i in range(4000)))
+    columns = [f"--column={role}" for role in ("seq=n", "time=when", "lost=gone")]
+    options = (*columns, "--delimiter", "space", "--format", "table")
+    status, said = agv_ncs("require", "config/outages.yaml", "--link", table, *options, "--json", found)
+    assert status == 0, said
+    assert re.search(r"Loss rate +0\.025 ", said)
+    assert json.loads(found.read_text())["unavailability"] == 0.0
+
+
+@pytest.mark.parametrize("option", ["--interval=0.02", "--delimiter=;", "--column=lost=gone", "--format=table"])
+def test_an_option_about_the_file_needs_the_file(option: str) -> None:
+    answer = CliRunner().invoke(main, ["require", str(REPOSITORY / "config/outages.yaml"), option])
+    assert (answer.exit_code, answer.output.count("\n")) == (1, 1)
+    assert f"{option.split('=')[0]} is about the file of a measured link: name it with --link" in answer.output
