@@ -31,6 +31,9 @@ from agv_ros.stopping import STOPPED_BY
 
 P = TypeVar("P", bound=LoopParameters)
 
+_SETTLING = 1.0 / 6.0
+"""Share of `stop_timeout` for which a node that is stopped takes part in a loop that goes on."""
+
 _POLL_PERIOD = 0.01
 """How often [s] a node looks for its subscribers and peers while it waits for them."""
 
@@ -211,9 +214,9 @@ class LoopNode(Node, Generic[P]):
     def is_settled(self) -> bool:
         """Has everything that is on its way to this node arrived? Polled for a moment when the node is stopped.
 
-        Where its peers go on, there is always more: after half of `stop_timeout` it has.
+        Where its peers go on, as in a loop in lockstep, there is always more: after _SETTLING of `stop_timeout` it has.
         """
-        return self._settling.is_over(self.received.total(), self.settings.stop_timeout / 2.0)
+        return self._settling.is_over(self.received.total(), _SETTLING * self.settings.stop_timeout)
 
     def close(self) -> None:
         """Report for the last time what was published. From then on the node acts on nothing that comes or is due."""

@@ -205,7 +205,13 @@ def start() -> Iterator[Start]:
     for child in started:
         if child.process.poll() is None:
             child.process.terminate()
-        child.process.communicate(timeout=30.0)
+    for child in started:
+        try:
+            child.process.communicate(timeout=30.0)
+        except subprocess.TimeoutExpired:  # it would answer the nodes of the tests to come
+            child.process.kill()
+            child.process.communicate()
+            pytest.fail(f"did not end when it was asked to: {child.process.args}")
 
 
 NO_ROS = """

@@ -758,17 +758,18 @@ def test_nodes_that_are_started_again_go_on_and_the_recording_tells(start: Start
     from agv_analysis.recordings.recording import read_run
 
     params = tmp_path / "params.yaml"
-    params.write_text("plant: {ros__parameters: {duration: 5.0, answer_timeout: 60.0}}")
+    params.write_text("plant: {ros__parameters: {duration: 20.0, answer_timeout: 60.0}}")
     arguments = ["--ros-args", "--params-file", str(params), "-p", "wait_for_subscribers:=2"]
     bag = ["-p", f"bag:={tmp_path / 'bag'}", "-p", f"params_file:={params}", "-p", "stop_timeout:=30.0"]
     recorder = start("agv_analysis.runtime.recorder_node", *arguments, *bag, "-p", "log_time:=stamp")
     modules = {kind.rpartition(".")[2].removesuffix("_node"): kind for kind in NODES}
     running = {node: start(module, *arguments) for node, module in modules.items()}
-    again = {"controller": 250, "error_detector": 500, "relay": 750}
+    again = {"controller": 600, "error_detector": 1800, "relay": 3000}
     for name, k in again.items():
         running["plant"].wait_for(f"step {k} of")
         running[name].process.send_signal(signal.SIGTERM)
         assert running[name].end()[0] == 0
+        assert running["plant"].process.poll() is None  # a node that is stopped leaves the loop, and does not end it
         running[name] = start(modules[name], *arguments)
     status, said = running["plant"].end(120.0)
     assert (status, "Traceback" in said) == (0, False)
@@ -778,7 +779,7 @@ def test_nodes_that_are_started_again_go_on_and_the_recording_tells(start: Start
         assert (status, "Traceback" in said) == (0, False)
     assert "started again: controller, error_detector, relay" in said
     run = read_run(tmp_path / "bag")
-    assert len(run) == 1000
+    assert len(run) == 4000
     assert abs(run.reference[-1, 1] - run.pose[-1, 1]) < 0.01
     notes = sorted(note for note in run.notes if "was started again" in note)
     assert [note.partition(" ")[0] for note in notes] == sorted(again)
