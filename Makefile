@@ -25,10 +25,12 @@ demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analy
 test: $(VENV)/test.stamp ## style, types, prose and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/codespell
 	$(BIN)/proselint --config .proselintrc.json check $(PROSE)
-	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n $(WORKERS) --dist worksteal $(PYTEST_ARGS)
+	@# mypy has one core, and takes its time: beside the tests, that wait now and then. It speaks at the end.
+	$(BIN)/mypy >$(VENV)/mypy.log 2>&1 & types=$$!; \
+	$(BIN)/python -m pytest -p pytest_cov -p xdist -p hypothesis.extra.pytestplugin -n $(WORKERS) --dist worksteal $(PYTEST_ARGS); \
+	tests=$$?; wait $$types; types=$$?; cat $(VENV)/mypy.log; exit $$((tests ? tests : types))
 
 coverage: PYTEST_ARGS += --cov --cov-report=term ## the same with coverage, which takes longer
 coverage: test

@@ -211,7 +211,7 @@ def start() -> Iterator[Start]:
         except subprocess.TimeoutExpired:  # it would answer the nodes of the tests to come
             child.process.kill()
             child.process.communicate()
-            pytest.fail(f"did not end when it was asked to: {child.process.args}")
+            pytest.fail(f"did not end when it was asked to: {child.process.args!r}")
 
 
 NO_ROS = """

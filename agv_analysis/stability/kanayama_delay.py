@@ -32,6 +32,9 @@ _ANGLES = (0.3, 0.8, 1.3, 1.57, 2.2, 3.0, 4.5, 7.0, 10.0)
 
 _ITERATIONS = 60
 
+_BLOCK = 8192
+"""Roots that are searched for at a time: what becomes of them fits the cache."""
+
 
 class KanayamaGains(Protocol):
     """Whatever has the gains of Kanayama's law: the controller's parameters, a point of a map."""
@@ -66,7 +69,9 @@ def radii_of(n: Floats, a: Floats, b: Floats, c: Floats, phi: Floats, parked: ND
     loop = _Loop.of(n, a, b, c, phi, parked)
     starts = _starts(loop)
     spread = _Loop(*(np.broadcast_to(values, starts.shape).ravel() for values in loop))
-    sigma = _newton(starts.ravel(), spread).reshape(starts.shape)
+    flat, blocks = starts.ravel(), range(0, starts.size, _BLOCK)
+    found = [_newton(flat[i : i + _BLOCK], _Loop(*(values[i : i + _BLOCK] for values in spread))) for i in blocks]
+    sigma = np.concatenate(found or [flat]).reshape(starts.shape)
     return np.asarray(np.nanmax(np.abs(1.0 + sigma), axis=0, initial=0.0))
 
 
