@@ -21,7 +21,7 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
 from agv_analysis.simulation.decay import Decay, decay, decay_over_links
-from agv_analysis.simulation.lanes import Choices, choices_of, fits_lanes, statistics_over_lanes
+from agv_analysis.simulation.lanes import VECTOR, Choices, choices_of, fits_lanes, statistics_over_lanes
 from agv_analysis.simulation.link_loop import LinkTrace, contraction_over_links, empty_trace, statistics_over_links
 from agv_analysis.simulation.loop import (
     Loop,
@@ -129,6 +129,8 @@ class _Batch:
         rows, columns = self.table.shape
         jobs = [(row, column) for column in range(columns) for row in range(rows)]
         size = max(2, min(_LARGEST_UNIT, len(jobs) // (4 * workers if workers > 1 else 1)))
+        if jobs and self._choices(0) is not None:  # a part of a vector would take as long as all of it
+            size = max(VECTOR, size // VECTOR * VECTOR)
         return [jobs[first : first + size] for first in range(0, len(jobs), size)]
 
     def work(self, unit: list[Job]) -> int:
@@ -142,7 +144,7 @@ class _Batch:
             try:
                 alone: list[Job] = []  # which the lanes leave over
                 for job, (steps, *metrics), of_start, *others in chain(
-                    self._over_lanes(reference, of_kind, realisations, parts, alone),
+                    self._over_lanes(reference, of_kind, realisations, alone),
                     run(reference, alone, realisations, parts),
                 ):
                     self.table[job] = (steps, *of_start, *metrics, *others)
@@ -162,13 +164,12 @@ class _Batch:
         return ""
 
     def _over_lanes(
-        self, reference: Floats, jobs: list[Job], realisations: Realisations, parts: Replacements, alone: list[Job]
+        self, reference: Floats, jobs: list[Job], realisations: Realisations, alone: list[Job]
     ) -> Iterator[Result]:
         """Side by side, as many as can be; all others come into `alone`."""
-        fits = HAS_NUMBA and not parts and fits_lanes(reference)
         groups: dict[Choices, list[Job]] = {}
         for job in jobs:
-            choices = self._choices(job[0]) if fits else None
+            choices = self._choices(job[0])
             (alone if choices is None else groups.setdefault(choices, [])).append(job)
         for of_group in groups.values():
             for first in range(0, len(of_group), LANES):
@@ -236,9 +237,12 @@ class _Batch:
 
     def _choices_of(self, row: int) -> Choices | None:
         """Those of a scenario's runs, None if they cannot be in lanes: only what is lost may be random in a slot."""
-        relay, plant = self._scenarios[row].relay, self._scenarios[row].plant
-        is_direct = relay.uplink.is_direct and relay.downlink.is_direct
-        return choices_of(self._settings(row)) if is_direct and not plant.is_noisy and plant.slip_noise == 0.0 else None
+        scenario = self._scenarios[row]
+        plant, links = scenario.plant, (scenario.relay.uplink, scenario.relay.downlink)
+        is_direct = all(link.is_direct for link in links) and not plant.is_noisy and plant.slip_noise == 0.0
+        if not (HAS_NUMBA and is_direct) or replacements_of(scenario) or not fits_lanes(self._reference(row)):
+            return None
+        return choices_of(self._settings(row))
 
     def _is_direct(self, job: Job) -> bool:
         relay = self._scenarios[job[0]].relay

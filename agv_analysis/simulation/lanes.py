@@ -51,13 +51,13 @@ from agv_analysis.simulation.loop import (
 )
 from agv_plant.vehicle.motion import Motion
 
-_BLOCK = 256
+_BLOCK = 1024
 """Steps whose poses are kept: those after which runs and twins are compared."""
 
 _STRETCH = 4096
 """Steps after which it is looked whether any lane still goes on."""
 
-_VECTOR = 8
+VECTOR = 8
 """Lanes are driven in multiples of this, the numbers in a vector of AVX-512: a part of one would be computed alone."""
 
 _LARGEST_HEADING = 1e5
@@ -212,7 +212,7 @@ class Group:
 
     def __init__(self, reference: Floats, inputs: Sequence[RunInputs]) -> None:
         self._reference, self.inputs, self.steps = reference, inputs, len(inputs[0].lost)
-        self.lanes = -(-len(inputs) // _VECTOR) * _VECTOR
+        self.lanes = -(-len(inputs) // VECTOR) * VECTOR
         self._outcomes = outcomes_of(inputs)
         self._like = LaneState(begin(inputs[0]), True, inputs[0].settings)
         self._mark = rows_needed(self._like.run)
