@@ -42,7 +42,7 @@ def command(
       agv-ncs watch --host 192.168.1.20 --port 8051 --no-browser
     """
     with needs_ros():
-        from agv_analysis.watch.watcher_node import watch
+        from agv_analysis.watch.watching import watch
     from agv_analysis.watch.beside_run import OF_RUN, SERVED, STOP
     from agv_ros.discovery import discovery_note
 

@@ -7,10 +7,7 @@ fraction of a callback for each message.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from pathlib import Path
+from collections.abc import Iterator
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -24,17 +21,10 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import TimeReference
 
-from agv_analysis.scenario import load_scenario
-from agv_analysis.watch.foxglove_server import foxglove_served
 from agv_analysis.watch.live_loop import DIAGNOSTICS, TOPICS
 from agv_analysis.watch.message_log import Heard
-from agv_analysis.watch.remote_parameters_node import RemoteParameters
-from agv_analysis.watch.watch_page import served
-from agv_analysis.watch.watch_session import TICK, WatchSession
 from agv_ros.endpoints import WATCHER, take_all
-from agv_ros.errors import UserError
 from agv_ros.node import ENDED
-from agv_ros.stopping import stop_on_signals
 
 _QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -44,12 +34,6 @@ _KINDS: dict[str, tuple[type, ...]] = {
     "/diagnostics": (DiagnosticArray,),
 }  # fmt: skip
 """Types that a topic may have; the first is listened to until another one is offered."""
-
-
-_LOOK = 20
-"""Ticks between two looks at the types that the loop's topics have."""
-
-EVERYWHERE = ("", "0.0.0.0", "::")
 
 
 class WatcherNode:
@@ -137,45 +121,3 @@ class WatcherNode:
             node.destroy_node()
         for context in self._contexts.values():
             context.try_shutdown()
-
-
-def watch(
-    namespace: str, config: Path | None, domains: tuple[int, int], folder: Path, where: tuple[str, int],
-    ready: Callable[[str, str], None], stop_run: Callable[[], None] | None, foxglove_port: int | None = None,
-) -> None:  # fmt: skip
-    """Serve the page of a namespace's loop at host and port `where`; `ready` receives its address.
-
-    `domains` are the DDS domains of AGV and edge, negative: the usual one. `stop_run` ends the run that the page
-    belongs to. With a `foxglove_port` a server for Foxglove stands beside the page, and `ready` receives its address as
-    well, which is empty otherwise. Raises UserError if the params file, host or a port cannot be used.
-    """
-    if where[0] in EVERYWHERE:
-        raise UserError(f"--host {where[0]!r} names no address: name the one by which others reach this machine")
-    scenario = None if config is None else load_scenario(str(config))
-    with stop_on_signals() as stop, ExitStack() as servers:
-        to_foxglove, send = "", None
-        if foxglove_port is not None:
-            to_foxglove, send = servers.enter_context(foxglove_served(foxglove_port))
-        watcher = WatcherNode(namespace, *domains)
-        remote = RemoteParameters(watcher.agv, watcher.edge)
-        session = WatchSession(watcher, remote, scenario, folder, stop_run, send)
-        try:
-            with served(session, *where) as address:
-                ready(address, to_foxglove)
-                _listen(session, lambda: stop.requested)
-                session.end()
-        finally:
-            session.close()
-            remote.close()
-            watcher.close()
-
-
-def _listen(session: WatchSession, is_done: Callable[[], bool]) -> None:
-    count, due = 0, time.monotonic()
-    while not is_done():
-        if count % _LOOK == 0:
-            session.watcher.look()
-        session.tick()
-        count, due = count + 1, max(due + TICK, time.monotonic())
-        time.sleep(max(0.0, due - time.monotonic()))
-    session.tick()
