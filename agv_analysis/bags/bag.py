@@ -28,6 +28,12 @@ from agv_analysis.bags.storage import Storage, is_large
 from agv_analysis.bags.topic_types import TopicTypes
 from agv_analysis.bags.type_hash import contradicts
 
+_MOST_EXPECTED = 2
+"""Messages a byte of the file for which room is made at once, whatever number a damaged file states.
+
+The smallest record of one has 31 bytes, and a compressed chunk is hardly ever 60 times as large.
+"""
+
 _THREADS = 2
 """Topics that are checked at a time."""
 
@@ -267,7 +273,8 @@ class _Reading:
                     what = "definition of its type that does not match the recorded hash, so that values may be wrong"
                     self._findings.add(f"{topic}: {what}")
                 helper = self._helper if is_large(storage.size) else None
-                expected, longest = storage.expected(channel.id), self._longest.get(topic)
+                expected = min(storage.expected(channel.id), _MOST_EXPECTED * storage.size)
+                longest = self._longest.get(topic)
                 self._tables[topic] = Table(definition.form, expected, helper, longest)
         except UndecodableError as error:
             self._refuse(topic, error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,8 +10,8 @@ import pytest
 
 from agv_analysis.bags import Bag, read_bag
 from fuzz.bases import NAMES, SQLITE3, base
-from fuzz.campaign import Case, Difference, case, compared, run
-from fuzz.mutations import file_of, records_of
+from fuzz.campaign import Case, Difference, case, compared, little_memory, run
+from fuzz.mutations import Record, file_of, records_of
 from fuzz.truth import rows_by_mcap
 
 
@@ -19,6 +20,22 @@ def test_no_case_shows_a_fault(tmp_path: Path) -> None:
     assert sum(result.cases.values()) == 50
     assert sum(result.compared.values()) > 10
     assert not result.faults, result.first
+
+
+def test_no_room_is_made_for_messages_that_a_small_file_cannot_have(tmp_path: Path) -> None:
+    """Of a million million that its statistics state."""
+    records = records_of(base("without CRCs"))
+    at = next(i for i, one in enumerate(records) if one.opcode == 11)
+    statistics = bytearray(records[at].content)
+    for place in range(46 + 2, len(statistics), 10):  # behind a length, pairs of channel and count
+        struct.pack_into("<Q", statistics, place, 10**12)
+    (tmp_path / "a.mcap").write_bytes(
+        file_of([*records[:at], Record(11, bytes(statistics)), *records[at + 1 :]], False)
+    )
+    with little_memory():
+        bag = read_bag(tmp_path / "a.mcap")
+    assert sum(topic.count for topic in bag.topics.values()) == 30
+    assert any("message that the recorder counted" in text for text in bag.problems), bag.problems
 
 
 def test_a_case_is_a_function_of_its_number() -> None:
