@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @with_force
 def command(
     file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, rtt: str, trace: Path | None,
-    picture: Path | None, json_file: Path | None, **said: Unpack[FileOptions],
+    picture: Path | None, json_file: Path | None, **file_options: Unpack[FileOptions],
 ) -> None:  # fmt: skip
     """Show what FILE says of a link: output of ping, irtt, owping, iperf3, a capture, a table, a bag, a line for netem.
 
@@ -59,7 +59,7 @@ def command(
     if params is None and (settings or corridor is not None):
         raise click.UsageError("--set and --corridor are about the loop of a params file: give PARAMS behind FILE")
     scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
-    reading = read_link_file(file, said)
+    reading = read_link_file(file, file_options)
     console = Console(highlight=False)
     if isinstance(reading, Setting):
         found = _setting(console, reading, scenario)

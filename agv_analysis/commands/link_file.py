@@ -52,7 +52,7 @@ def with_link_file(command: F) -> F:
     return command
 
 
-def read_link_file(file: Path, said: FileOptions) -> Reading:
+def read_link_file(file: Path, file_options: FileOptions) -> Reading:
     """Read a measured link, a long file under a progress bar. Raises MeasurementError for one that is none."""
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.link.formats import read_link
@@ -60,9 +60,11 @@ def read_link_file(file: Path, said: FileOptions) -> Reading:
     from agv_analysis.link.formats.netem_line import setting
     from agv_analysis.link.netem_text import is_netem
 
-    columns = dict(map(_column, said["columns"]))
-    options = Options(said["interval"], columns, said["delimiter"], said["topic"], said["received"])
-    name = said["format_name"]
+    columns = dict(map(_column, file_options["columns"]))
+    options = Options(
+        file_options["interval"], columns, file_options["delimiter"], file_options["topic"], file_options["received"]
+    )
+    name = file_options["format_name"]
     if is_netem(str(file)) and not os.path.exists(file):  # noqa: PTH110  # Path.exists minds what is too long for a name
         return setting(str(file), "the command line")
     if not file.is_file() or file.stat().st_size < _LONG:
@@ -73,12 +75,12 @@ def read_link_file(file: Path, said: FileOptions) -> Reading:
         return read_link(file, replace(options, progress=lambda share: progress(round(100 * share))), name)
 
 
-def refuse_without_file(said: FileOptions) -> None:
+def refuse_without_file(file_options: FileOptions) -> None:
     """Raises UserError if an option of `with_link_file` is given to a command that has no measured link to read."""
     from agv_ros.errors import UserError
 
     names = {"format_name": "--format", "columns": "--column"}
-    given = [names.get(name, f"--{name}") for name, value in said.items() if value]
+    given = [names.get(name, f"--{name}") for name, value in file_options.items() if value]
     if given:
         what = "are" if len(given) > 1 else "is"
         raise UserError(f"{', '.join(given)} {what} about the file of a measured link: name it with --link")

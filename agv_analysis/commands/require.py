@@ -47,7 +47,7 @@ def command(
     params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
     name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
     survival_time: float | None, transfer_interval: float | None, latency: float | None, table: Path | None,
-    report: Path | None, json_file: Path | None, **said: Unpack[FileOptions],
+    report: Path | None, json_file: Path | None, **file_options: Unpack[FileOptions],
 ) -> None:  # fmt: skip
     """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
 
@@ -82,7 +82,7 @@ def command(
             "--transfer-interval is offered with a --survival-time, --availability, --mtbf or --class: give one"
         )
     if file is None:
-        refuse_without_file(said)
+        refuse_without_file(file_options)
     scenario = load_scenario(params, (*settings, *corridor_settings(corridor, corridor_along)))
     classes = load_classes(*files)
     if name is not None:
@@ -94,7 +94,7 @@ def command(
     console = Console(highlight=False)
     with Console(stderr=True).status("computing what the loop asks ..."):
         loop = require(scenario)
-    link = _link_of(scenario, loop, file, said)  # which may have a progress bar of its own
+    link = _link_of(scenario, loop, file, file_options)  # which may have a progress bar of its own
     enough = {one.name: would_do(one, loop) for one in classes}
     met = {one.name: meets(one, link) for one in classes}
     sections: dict[str, list[tuple[str, ...]]] = {"What the loop asks of its radio": list(rows_of_loop(loop))}
@@ -143,7 +143,7 @@ def _asked(availability: float | None, mtbf: float | None) -> ServiceClass:
 
 
 def _link_of(
-    scenario: Scenario, loop: LoopRequirements, file: Path | None, said: FileOptions
+    scenario: Scenario, loop: LoopRequirements, file: Path | None, file_options: FileOptions
 ) -> LinkAvailability | None:
     """What the measured link gives, or the scenario's uplink; None where nothing is known of it, or of the loop."""
     from agv_analysis.link.link_figures import LinkFigures
@@ -156,7 +156,7 @@ def _link_of(
     slots = loop.survival_slots
     uplink = scenario.relay.uplink
     if file is not None:
-        reading = read_link_file(file, said)
+        reading = read_link_file(file, file_options)
         if isinstance(reading, LossRates):
             raise UserError(reading.refusal)
         if isinstance(reading, Measurement):
