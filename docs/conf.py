@@ -14,12 +14,14 @@ project = "agv_ncs"
 author = "The agv_ncs developers"
 copyright = author  # noqa: A001 - Sphinx' name for it
 
-# rosdoc2 runs a copy of this folder elsewhere, with the package installed, and knows its version.
+# rosdoc2 runs a copy of this folder, in one below the package or elsewhere, and knows the version.
+package = None
 for folder in Path(__file__).resolve().parents:
     if (folder / "package.xml").is_file():
         sys.path.insert(0, str(folder))
         release = re.findall(r"<version>(.+?)</version>", (folder / "package.xml").read_text(encoding="utf-8"))[0]
         html_title = f"agv_ncs {release}"
+        package = folder
         break
 
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
@@ -43,6 +45,17 @@ def literal_blocks(_app: Any, _what: str, _name: str, _obj: Any, _options: Any, 
             lines[i:i] = ["::", ""]
 
 
+def included(app: Any, _name: str, source: list[str]) -> None:
+    """Have a page that is a file of the package's root be that file where a copy of this folder does not lie beside it.
+
+    Links there go to docs/, which is the folder of the page.
+    """
+    file = re.match(r"```\{include\} \.\./(\S+)", source[0])
+    if file is not None and package is not None and not (Path(app.srcdir).parent / file[1]).is_file():
+        source[0] = (package / file[1]).read_text(encoding="utf-8").replace("](docs/", "](")
+
+
 def setup(app: Any) -> None:
-    """Register what Sphinx calls for each docstring."""
+    """Register what Sphinx calls for each docstring and for each page."""
     app.connect("autodoc-process-docstring", literal_blocks)
+    app.connect("source-read", included)

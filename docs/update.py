@@ -43,6 +43,7 @@ def paper_page(out: str) -> str:
     """docs/paper.md; the paper is reproduced in the directory `out`."""
     from agv_analysis.output_file import MARKDOWN_MARK
     from agv_analysis.reproduce.citation import CITATION
+    from agv_analysis.reproduce.report import TWINS
 
     command("reproduce", "--out", out)
     return (
@@ -53,9 +54,10 @@ def paper_page(out: str) -> str:
         "(twins, a pose that is always n steps old, scans of a gain) is simulated either way. The paper's text gives "
         "neither its track nor K_y and K_theta: the scenario is a choice. Sections and equations are numbered as the "
         "paper prints them.\n\nAn error has settled when less than 1 cm is left of it, a command when `v - v_r` stays "
-        "within 2 % of its largest value. Steps count from k = 0. Twins are two AGVs that begin a micrometre apart and "
-        "meet the same losses; their number is their distance at the end as a multiple of that at the "
-        "beginning.\n\n" + (Path(out) / "claims.md").read_text(encoding="utf-8").removesuffix(MARKDOWN_MARK)
+        "within 2 % of its largest value. Steps count from k = 0. "
+        + TWINS
+        + "\n\n"
+        + (Path(out) / "claims.md").read_text(encoding="utf-8").removesuffix(MARKDOWN_MARK)
     )
 
 

@@ -6,9 +6,11 @@ import ast
 import importlib.util
 import math
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
+import types
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -145,6 +147,21 @@ def test_rosdoc2_finds_the_pages() -> None:
     _, settings = yaml.safe_load_all((REPOSITORY / found).read_text(encoding="utf-8"))
     (builder,) = settings["builders"]
     assert (REPOSITORY / builder["sphinx"]["sphinx_sourcedir"] / "conf.py").is_file()
+
+
+def test_rosdoc2_s_copy_of_the_pages_has_the_changelog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It lies in a folder below the package, so that `../CHANGELOG.md` is not there."""
+    monkeypatch.setattr(sys, "path", list(sys.path))  # which conf.py changes
+    copy = tmp_path / "build/copy"
+    copy.mkdir(parents=True)
+    for name in ("package.xml", "CHANGELOG.md"):
+        shutil.copy(REPOSITORY / name, tmp_path)
+    conf: dict[str, Any] = {"__file__": str(copy / "conf.py")}
+    exec((REPOSITORY / "docs/conf.py").read_text(encoding="utf-8"), conf)
+    source = [(REPOSITORY / "docs/changelog.md").read_text(encoding="utf-8")]
+    conf["included"](types.SimpleNamespace(srcdir=copy), "changelog", source)
+    assert source[0].startswith("# Changelog")
+    assert "](docs/" not in source[0]
 
 
 def test_the_answer_in_metres_of_the_readme_is_true() -> None:

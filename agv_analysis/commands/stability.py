@@ -109,8 +109,8 @@ def command(
         within_it = beside.submit(corridor, scenario, laps, within_corridor)
         found, run = margins(scenario), with_an_end(scenario)
         twins = simulated_twins(run, seeds)
-        status.update("simulating twins under more and more losses ...")
-        border = twins_border(run, progress=lambda done: status.update(f"simulating twins: {done} loss probabilities"))
+        status.update("simulating under more and more losses ...")
+        border = twins_border(run, progress=lambda done: status.update(f"simulated: {done} loss probabilities"))
         found = dataclasses.replace(found, twins=twins, found={**found.found, border.name: border})
         evidence = evidence_of_scenario(scenario, twins.evidence)
         verdict = decide(evidence)
@@ -119,7 +119,7 @@ def command(
     print_framed(console, _headlines(verdict, evidence, within))
     said_of_twins = _told(twins, seeds)
     if twins.contracting and not settles_without_losses(scenario):
-        said_of_twins += "; they come together, but the loop does not settle even without losses"
+        said_of_twins += "; they converge, but the loop does not settle even without losses"
     elif not twins.is_long_enough and settles_without_losses(scenario):
         said_of_twins += f"; {too_short(twins.left_without_losses)}"
     policy = scenario.error_detector.policy
@@ -147,7 +147,9 @@ def command(
     for note in () if within is None else within.notes:
         console.print(f"[bold yellow]Corridor:[/] {escape(note)}.")
     if found.left_out:
-        console.print(f"[bold yellow]Left out of all margins, not of the twins:[/] {', '.join(found.left_out)}.")
+        console.print(
+            f"[bold yellow]Left out of all margins, not of the simulation check:[/] {', '.join(found.left_out)}."
+        )
     if json_file is not None:
         link = evidence.link  # as a run shows it, where the channel is not known
         fit = None if link is None else {"goodness": link.goodness.to_json()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -170,7 +171,7 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
         table.add_row(
             *(_plain(row[axis.name]) for axis in sweep.axes),
             f"{row['unstable']} of {row['runs']}", "-" if row["undecided"] else f"{row['instability']:.3f}",
-            f"{row['instability_low']:.3f} .. {row['instability_high']:.3f}", f"{row['settle_1cm_steps_p50']:g}",
+            f"{row['instability_low']:.3f} .. {row['instability_high']:.3f}", _steps(row["settle_1cm_steps_p50"]),
             metres(row["deviation_max_p50"]),
         )  # fmt: skip
     console = Console(highlight=False)
@@ -185,7 +186,7 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     if unsaid:
         console.print(
             f"[bold yellow]Undecided:[/] {unsaid} runs are shorter than the transient of the loop without losses, "
-            "so twins that are not closer by their end say nothing; make plant.duration longer."
+            "so neighbouring trajectories that are not closer by their end say nothing; make plant.duration longer."
         )
 
 
@@ -214,6 +215,7 @@ _IN_A_LAP = "leaves in\na lap"
 
 def _table(sweep: Sweep, names: Sequence[str] = ()) -> Table:
     """A table that begins with a column for each axis, as narrow as its name allows."""
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
@@ -221,12 +223,13 @@ def _table(sweep: Sweep, names: Sequence[str] = ()) -> Table:
         name = axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name
         table.add_column(name, justify="right", no_wrap=True)
     for name in names:
-        table.add_column(name, justify="right", no_wrap=name != _IN_A_LAP)
+        table.add_column(escape(name), justify="right", no_wrap=name != _IN_A_LAP)
     return table
 
 
 def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
     """What each point does within its corridor, the best one marked."""
+    from agv_analysis.metrics.confidence import computed
     from agv_analysis.sweep.corridors import best_for_corridor
 
     best = best_for_corridor(sweep, rows)
@@ -234,7 +237,7 @@ def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
     for row in rows:
         table.add_row(
             *(_plain(row[axis.name]) for axis in sweep.axes), f"{row['n_single']:g}", f"{row['n_any']:g}",
-            f"{row['p_lap']:.3g} ({row['p_lap_low']:.2g} .. {row['p_lap_high']:.2g})", f"{row['p_hour']:.3g}",
+            f"{row['p_lap']:.3g} ({row['p_lap_low']:.2g} .. {row['p_lap_high']:.2g})", computed(row["p_hour"]),
             f"{row['mean_time_s']:.3g}", "most rarely" if row is best else "",
         )  # fmt: skip
     return table
@@ -254,6 +257,10 @@ def _verdicts(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
         values = (_plain(row[axis.name]) for axis in sweep.axes)
         table.add_row(*values, f"[{colour_of(word)}]{word}[/]", escape(row["verdict_reason"]))
     return table
+
+
+def _steps(count: float) -> str:
+    return "-" if math.isnan(count) else "never" if math.isinf(count) else f"{count:g}"
 
 
 def _plain(value: Any) -> str:

@@ -130,7 +130,7 @@ class Corridor:
 
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
-        return f"{probability(lap)} a lap, {probability(hour)} an hour (by {self.leaving.method})"
+        return f"{probability(lap)} a lap, {in_an_hour(lap, hour)} an hour (by {self.leaving.method})"
 
     def to_json(self) -> dict[str, Any]:
         """The figures by name; SI units, intervals of 95 %."""
@@ -320,6 +320,11 @@ def probability(p: Estimate) -> str:
     if p.low > 0.999:
         return "above 99.9 %"
     return f"{percent(p.value)} ({percent(p.low)} .. {percent(p.high)})"
+
+
+def in_an_hour(lap: Estimate, hour: Estimate) -> str:
+    """The probability of an hour, which floats round to 1 where that of a lap is not."""
+    return "above 99.9 %" if hour.low == 1.0 and lap.low < 1.0 else probability(hour)
 
 
 def _time(mean: Estimate | None) -> str:

@@ -22,6 +22,7 @@ from agv_analysis.corridor.rare_leaving import outages_of
 from agv_analysis.corridor.single_outage import roughly
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.link.markov_channel import Chain, chain_of
+from agv_analysis.metrics.confidence import computed_after_of
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.derived_loop import has_closed_form
 from agv_analysis.stability.margin_map import CURVATURE, SPEED, TS, MarginMap, axes_of, scenario_at
@@ -91,8 +92,10 @@ def best_point(found: MarginMap) -> str:
     where = f"{found.labels[0]} = {found.first[row]:.4g}, {found.labels[1]} = {found.second[column]:.4g}"
     n = int(n_any[row, column])
     outages = "any outages" if n >= LIMIT else f"any outages of up to {n} slots"
-    left = "" if p_hour is None else f", left in an hour with probability {p_hour[row, column]:.3g}"
-    return f"best kept at {where}: in {outages}{left}"
+    kept = f"best kept at {where}: in {outages}"
+    if p_hour is None:
+        return kept
+    return f"{kept}, left in an hour with a probability {computed_after_of(p_hour[row, column].item())}"
 
 
 def _driven(scenario: Scenario, place: Mapping[str, float], widths: Widths) -> int:

@@ -55,8 +55,11 @@ pre { white-space: pre-wrap }
 #badge .bounded, #badge .undecided, #badge .unknown { color: var(--fair) } #badge .old { opacity: .4 }
 #plots { display: grid; grid-template-columns: minmax(0, 2fr) minmax(0, 3fr) }
 #plot-track, #plot-time { height: 620px }
-@media (max-width: 1200px) { #plots { display: block } #plot-track { height: 400px } }
+/* Lines for the longest usual reason, some 240 letters. */
 #badge-why { height: 2.8em; overflow: auto; font-size: .9rem; color: var(--soft); margin-top: .2rem }
+@media (max-width: 1200px) {
+  #plots { display: block } #plot-track { height: 400px } #badge-why { height: 5.6em }
+}
 #pinned-name, #problem { height: 1.4em; overflow: auto; white-space: pre-wrap; font-size: .9rem; color: var(--soft) }
 #problem { color: var(--bad) }
 #lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
@@ -70,7 +73,8 @@ pre { white-space: pre-wrap }
   }
   #drawer > summary { display: block; padding: .4rem 0; font-weight: 600; cursor: pointer }
   #controls { max-height: 45vh; overflow-y: auto }
-  #badge-why { height: 4.2em }
+  .modebar-container { display: none } /* no room: it would lie on the names of the lines */
+  #badge-why { height: 7em; font-size: .8rem }
   #badge b { font-size: .95rem } #badge > div { padding: .2rem .4rem; font-size: .72rem } #badge { height: 6.4rem }
   th, td { padding-right: .4rem; font-size: .85rem } td { overflow-wrap: anywhere }
 }

@@ -29,6 +29,34 @@ def percent(probability: float) -> str:
     return "below 0.1 %" if 0.0 < probability < 0.001 else f"{100.0 * probability:.3g} %"
 
 
+def percent_after_of(probability: float) -> str:
+    """The same, as it stands behind "a probability": `of 95.7 %`, `above 99.9 %`."""
+    return _after_of(percent(probability))
+
+
+def computed(probability: float) -> str:
+    """A probability that was computed and is neither 0 nor 1, although floats may round it there.
+
+    Of a rare event not in per cent, and not more exactly than its model can be.
+    """
+    if probability < _RAREST:
+        return f"below {_RAREST:g}"
+    return f"{probability:.2g}" if probability < 0.001 else percent(min(probability, math.nextafter(1.0, 0.0)))
+
+
+def computed_after_of(probability: float) -> str:
+    """The same, as it stands behind "a probability"."""
+    return _after_of(computed(probability))
+
+
+def _after_of(shown: str) -> str:
+    return shown if shown[0].isalpha() else f"of {shown}"
+
+
+_RAREST = 1e-12
+"""No channel's parameters are known so well that a smaller probability could be told from another."""
+
+
 def _at_most(hits: int, trials: int, p: float) -> float:
     """P(X <= hits) for X binomial, 0 < p < 1."""
     k = np.arange(hits + 1)

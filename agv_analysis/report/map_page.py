@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.corridor.corridor_map import N_ANY, P_HOUR, TITLES
-from agv_analysis.metrics.confidence import percent
+from agv_analysis.metrics.confidence import computed
 from agv_analysis.report.heat_map import colour_scale, heat_map_layout
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import plain
@@ -55,6 +55,7 @@ def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: st
         at=f"{rows} by {columns} points about the scenario's own",
         sections=[{"key": name, "title": _capital(titles[name]), "height": 460} for name in found.margins],
         chosen=_nearest(found, scenario),
+        columns=columns,
         scenario=scenario,
         parameters=parameters,
         reproduce=command,
@@ -70,7 +71,7 @@ def map_sentence(found: MarginMap, scenario: Scenario) -> str:
     at = ", ".join(
         f"{_symbol(scenario, axis)} = {number(value)} {axes_of(scenario)[axis][1]}" for axis, value in values
     )
-    said = (f"{title}: {_said(name, found.margins[name][i, j].item())}" for name, title in _shown(found))
+    said = (f"{title}: {_texts(found, name)[i][j]}" for name, title in _shown(found))
     return f"At {at}: {'; '.join(said)}."
 
 
@@ -98,9 +99,19 @@ def _shown(found: MarginMap) -> Iterator[tuple[str, str]]:
     return ((name, titles[name]) for name in found.margins)
 
 
+def _texts(found: MarginMap, name: str) -> list[list[str]]:
+    """What a margin is at each point, in words."""
+    values = found.margins[name]
+    if name != P_HOUR:
+        return [[_said(name, value) for value in row] for row in values.tolist()]
+    outside = found.margins[N_ANY] < 0
+    return [
+        ["1: it is outside even without outages" if is_outside else computed(value) for value, is_outside in row]
+        for row in np.stack((values, outside), axis=-1).tolist()
+    ]
+
+
 def _said(name: str, value: float) -> str:
-    if name == P_HOUR:
-        return percent(value)
     outside = "outside" if name == N_ANY else "unstable"
     return f"{outside} even without outages" if value < 0 else f"{value:g} slots"
 
@@ -129,7 +140,7 @@ def _heat_map(found: MarginMap, name: str, words: tuple[str, str]) -> dict[str, 
         heat |= {"z": [plain(row) for row in values], "zmin": 0.0, "zmax": 1.0, "colorscale": scale}
     else:
         heat |= _by_size(values)
-    heat["text"] = [[_said(name, value) for value in row] for row in values.tolist()]
+    heat["text"] = _texts(found, name)
     heat["hovertemplate"] = f"{words[0]}: %{{x:.4g}}<br>{words[1]}: %{{y:.4g}}<br>%{{text}}<extra></extra>"
     layout = heat_map_layout(*words)
     layout["xaxis"] |= _scale(found.second)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -69,6 +70,15 @@ _LEGEND_BELOW = {
 _LEGEND_ROW = 19
 """Its height [pixels]."""
 
+_LEGEND_LINE = 14
+"""Height of a further line of one name [pixels]."""
+
+_COLUMN = 22
+"""Letters of a name in one line of a column."""
+
+_MODE_BAR = 32
+"""Height of the buttons that plotly.js shows on top of a figure [pixels]."""
+
 _SPIKE = {"spikethickness": 1, "spikedash": "solid", "spikecolor": "#8a8a8a"}
 
 _GAP = 0.22
@@ -86,11 +96,12 @@ def figure(
     print they stay sharp.
     """
     is_long = len(panels) == 1 and len(panels[0].lines) > _FEW_LINES
-    below = _LEGEND_ROW * -(-len(panels[0].lines) // 2) + 8 if is_long else 0
+    below = _height_below([line.name for line in panels[0].lines]) if is_long else 0
     rows, is_track = len(panels), panels[0].equal
+    above = _MODE_BAR + (0 if is_long else _LEGEND_ROW)
     found: list[dict[str, Any]] = []
     layout: dict[str, Any] = {
-        "margin": {"l": 60, "r": 12, "t": 32 if rows == 1 else 10, "b": 44 + below},
+        "margin": {"l": 60, "r": 12, "t": above if rows == 1 else 10, "b": 44 + below},
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "modebar": {"bgcolor": "rgba(0,0,0,0)"},
@@ -114,7 +125,22 @@ def figure(
         layout[f"legend{number}"] = _LEGEND_BELOW if is_long else {**_LEGEND, "y": top, "yanchor": "bottom"}
         of_row = {"yaxis": f"y{number}", "legend": f"legend{number}"}
         found += [_trace(line, most, markers) | of_row for line in panel.lines]
+    if is_long:
+        for trace in found:
+            trace["name"] = "<br>".join(_wrapped(trace["name"]))
     return {"data": found, "layout": layout}
+
+
+def _wrapped(name: str) -> list[str]:
+    """A name in lines that fit a column of a legend below a figure, on a phone as well."""
+    return textwrap.wrap(name, _COLUMN, break_long_words=False) or [name]
+
+
+def _height_below(names: Sequence[str]) -> int:
+    """Height of a legend of two columns [pixels]."""
+    lines = [len(_wrapped(name)) for name in names]
+    further = sum(max(lines[row : row + 2]) - 1 for row in range(0, len(lines), 2))
+    return _LEGEND_ROW * -(-len(lines) // 2) + _LEGEND_LINE * further + 8
 
 
 def traces(lines: Sequence[Line], most: int = MOST_POINTS) -> list[dict[str, Any]]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from agv_analysis.metrics.confidence import computed
 from agv_analysis.report.table import metres
 from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.plan import Sweep
@@ -43,7 +44,7 @@ def _columns(sweep: Sweep, first: Row) -> list[tuple[str, Callable[[Row], str]]]
     if "p_lap" in first:
         found += [
             ("any outages in the corridor, up to [slots]", lambda row: _outages(row["n_any"])),
-            ("leaves the corridor in an hour", lambda row: _digits(row["p_hour"])),
+            ("leaves the corridor in an hour", lambda row: computed(row["p_hour"])),
         ]
     else:
         found += [

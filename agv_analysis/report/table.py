@@ -258,7 +258,7 @@ def _criteria(analysis: Analysis) -> Iterator[tuple[str, str]]:
         if found.why:
             yield found.label, _judged(found.stable, escape(found.why))
     verdict = analysis.verdict
-    yield "Verdict", f"[bold {colour_of(verdict.word)}]{verdict.word}[/] (by {by_what(verdict.criterion)})"
+    yield "Decided by", by_what(verdict.criterion)
     if verdict.word in GREEN:
         yield "Margin", escape(verdict.margin)
     yield "Because", escape(verdict.reason)

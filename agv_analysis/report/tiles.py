@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
-from agv_analysis.metrics.confidence import percent
+from agv_analysis.metrics.confidence import percent_after_of
 from agv_analysis.report.table import metres
 from agv_analysis.stability.analysis import Analysis, Observations
 from agv_analysis.stability.verdict import GREEN
@@ -55,8 +55,7 @@ def _word(analysis: Observations) -> tuple[str, str]:
 
 def confidence_text(probability: float) -> str:
     """How probable a stable loop is given the losses that were seen."""
-    shown = percent(probability)
-    return f"stable with a probability {shown if shown[0].isalpha() else f'of {shown}'}"
+    return f"stable with a probability {percent_after_of(probability)}"
 
 
 def _corridor(within: CorridorOfRun | None) -> tuple[str, str]:

@@ -12,7 +12,7 @@ from agv_analysis.report.page import template, write_page
 from agv_analysis.reproduce.citation import ARXIV, AUTHORS, DOI, TITLE
 from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding
 from agv_analysis.reproduce.figures import Figure
-from agv_analysis.reproduce.report import Table, measured_text, text_of
+from agv_analysis.reproduce.report import TWINS, Table, measured_text, text_of
 
 PAGE = "claims.html"
 
@@ -53,7 +53,7 @@ def write(findings: Sequence[Finding], drawn: Sequence[Figure], tables: Sequence
         title=f"The paper's claims: {TITLE}",
         heading=f"Of {len(findings)} claims {counts[HOLDS]} hold and {counts[FAILS]} do not; {counts[REMARK]} hold "
         f"with a remark, {counts[PART]} in part",
-        authors=AUTHORS, paper=TITLE, arxiv=ARXIV, doi=DOI, pictures=pictures,
+        authors=AUTHORS, paper=TITLE, arxiv=ARXIV, doi=DOI, twins=TWINS, pictures=pictures,
         others=_rows([finding for finding in findings if finding.claim.key not in shown]),
         tables=[(one.title, list(one.rows[0]), _cells(one), _source(folder / f"{one.key}.png")) for one in tables],
     )  # fmt: skip

@@ -21,6 +21,12 @@ _ROUNDING = 1e-9
 DIVERGED = 1e9
 """From this size on a measured value says nothing but that the loop diverges."""
 
+TWINS = (
+    "Twins are two AGVs that begin a micrometre apart and meet the same losses; their number is their distance at the "
+    "end as a multiple of that at the beginning."
+)
+"""What stands beside the claims, which name them."""
+
 _COLOURS = {HOLDS: "green", REMARK: "yellow", PART: "yellow", FAILS: "red"}
 
 
@@ -71,7 +77,9 @@ def print_claims(findings: Sequence[Finding]) -> None:
         verdict = f"[{_COLOURS[judgement.verdict]}]{judgement.verdict}[/]{remark}"
         cells = (finding.claim.where, finding.claim.text, measured_text(finding.measured))
         grid.add_row(*map(escape, cells), verdict)
-    Console(highlight=False).print(grid)
+    console = Console(highlight=False)
+    console.print(grid)
+    console.print(TWINS)
 
 
 def print_table(table: Table) -> None:

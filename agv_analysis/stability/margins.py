@@ -125,11 +125,11 @@ class Margins:
             return ""
         if twins is not None and twins < square:
             return (
-                f"a loss rate below {twins:.3g}, up to which most simulated twins contract: the mean square of small "
+                f"a loss rate below {twins:.3g}, up to which most simulated runs converge: the mean square of small "
                 f"errors dies out up to {square:.4g}, but the loop's errors do not stay small"
             )
         others = [f"almost every run converges up to {sure:.4g} to first order"] if sure and sure > square else []
-        others += [] if twins is None else [f"most simulated twins contract up to {twins:.3g}"]
+        others += [] if twins is None else [f"most simulated runs converge up to {twins:.3g}"]
         beyond = f"; {', '.join(others)}, but there rare long outages decide how far the AGV goes" if others else ""
         guaranteed = (
             ""
@@ -176,9 +176,9 @@ class Margins:
         if max(growing) * (self.twins.steps or 1) > -_PLAIN:
             return  # too short a run for E[e^2] to die out
         yield (
-            "with the links as they are a small error dies out in mean square, but of the scenario's simulated twins "
-            f"{self.twins.contracting} of {len(self.twins.contraction)} contract: far from its reference the loop is "
-            "not the linear one"
+            "with the links as they are a small error dies out in mean square, but neighbouring trajectories "
+            f"converge in {self.twins.contracting} of {len(self.twins.contraction)} simulated runs: far from its "
+            "reference the loop is not the linear one"
         )
 
     def _twins_to_json(self) -> dict[str, Any]:

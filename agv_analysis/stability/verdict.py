@@ -288,5 +288,5 @@ def _against_stability(evidence: Evidence) -> str:
         if not repeated.meets:
             return "simulated under these losses, an AGV that begins on the track and this one do not come together"
     if twins is not None and twins[0] < _SURE_OF_RUNS * twins[1]:
-        return f"simulated twins contract in {twins[0]} of {twins[1]} runs only"
+        return f"neighbouring trajectories converge in {twins[0]} of {twins[1]} simulated runs only"
     return ""

@@ -23,6 +23,7 @@ from agv_analysis.link.goodness_of_fit import Goodness
 from agv_analysis.link.periodic_outages import period_of
 from agv_analysis.link.reception_intervals import Outcomes, Steps
 from agv_analysis.link.transitions import count_transitions
+from agv_analysis.metrics.confidence import percent_after_of
 from agv_analysis.stability.confidence.growth_posterior import moved
 from agv_analysis.stability.confidence.segment_confidence import SegmentConfidence, segment_confidence
 from agv_analysis.stability.linear_loop import LinearLoop
@@ -86,11 +87,9 @@ class LinkConfidence:
             "unstable": "the mean square of the error grows",
             "undecided": "the recording does not show whether the mean square of the error dies out",
         }[worst.word]
-        more = self.record_seconds_more
+        more, sure = self.record_seconds_more, percent_after_of(worst.probability_stable)
         longer = "" if more is None else f"; recording about {more:g} s more would probably decide it"
-        return (
-            f"{where}{said}: {worst.why} (the error dies out with probability {worst.probability_stable:.3g}){longer}"
-        )
+        return f"{where}{said}: {worst.why} (the error dies out with a probability {sure}){longer}"
 
     def to_json(self) -> dict[str, Any]:
         """`confidence`, `growth_interval`, `record_seconds_more`, `stationarity`, and the segments."""

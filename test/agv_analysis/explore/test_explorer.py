@@ -531,6 +531,36 @@ def test_the_address_holds_the_setting(page: Page, address: str) -> None:
     assert page.text("problem") == ""
 
 
+LONG_REASON = (
+    "Why: the mean square of the error grows: a Gilbert channel describes the outcomes, of 205 complete outages (the "
+    "error dies out with a probability below 0.1 %); only the limit on the speed bounds the error, at 0.321 m in 600 s "
+    "of simulation."
+)
+"""The explorer's answer to K_x = 250 and v_max = 3 on config/outages.yaml."""
+
+
+def fits(page: Page, name: str, text: str) -> bool:
+    """Is a text seen whole, without scrolling, where `name` stands?"""
+    script = """
+      const at = document.getElementById(arguments[0]), before = at.textContent;
+      at.textContent = arguments[1];
+      const fits = at.scrollHeight <= at.clientHeight;
+      at.textContent = before;
+      return fits;"""
+    return bool(page.chrome.execute_script(script, name, text))
+
+
+@pytest.mark.parametrize("width", [390, 1000, 1400])
+def test_the_usual_reasons_are_seen_whole(page: Page, width: int) -> None:
+    size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 900}
+    try:
+        page.chrome.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        assert fits(page, "badge-why", LONG_REASON)
+        assert not fits(page, "badge-why", LONG_REASON * 5)
+    finally:
+        page.chrome.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_on_a_phone_results_come_first_and_controls_are_in_a_drawer(page: Page) -> None:
     size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
     try:

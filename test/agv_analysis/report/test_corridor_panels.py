@@ -44,6 +44,31 @@ def test_the_report_shows_corridor_and_tube(judged: tuple[Analysis, CorridorOfRu
     assert "corridor" not in {panel.key for panel in all_panels(analysis)}
 
 
+def test_no_name_of_the_legend_is_cut_off(
+    judged: tuple[Analysis, CorridorOfRun], chromium: Chrome, tmp_path: Path
+) -> None:
+    from test.agv_analysis.report.test_report import of_plot, show
+
+    (path := tmp_path / "report.html").write_text(render(*judged), encoding="utf-8")
+    size = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    try:
+        chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        show(chromium, path)
+        names = "[...plot.querySelectorAll('.legendtext')]"
+        assert "tube for any outages up to 14 slots" in of_plot(
+            chromium,
+            "track",
+            f"{names}.map(name => [...name.querySelectorAll('tspan')].map(t => t.textContent).join(' '))",
+        )
+        past = of_plot(
+            chromium, "track",
+            f"Math.max(...{names}.map(one => one.getBoundingClientRect().right)) - plot.getBoundingClientRect().right",
+        )  # fmt: skip
+        assert past <= 0.0
+    finally:
+        chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_the_cursor_goes_through_the_panel_of_the_corridor_as_well(
     judged: tuple[Analysis, CorridorOfRun], chromium: Chrome, tmp_path: Path
 ) -> None:

@@ -42,7 +42,40 @@ def test_a_map_has_a_page_with_points_to_click(
             command == f"agv-ncs stability params.yaml --set controller.kx={point['kx']} --set plant.ts={point['ts']}"
         )
         cells = [cell.text for cell in chromium.find_elements("css selector", "#point-values td")]
-        assert ("unstable even without outages" if shown == -1 else str(shown)) in cells
+        assert ("unstable even without outages" if shown == -1 else f"{shown} slots") in cells
+
+
+def test_a_map_says_no_probability_that_floats_round_to_certainty(
+    chromium: Chrome, agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    """Some 500 outages an hour lead outside at K_x = 25: that one does is not certain, only 1 to sixteen digits."""
+    page = tmp_path / "map.html"
+    options = ("--csv", tmp_path / "map.csv", "--picture", tmp_path / "map.png", "--report", page)
+    status, said = agv_ncs(
+        "stability", "config/outages.yaml", "--corridor", "0.25", "--map", "kx,ts", "--points", "5", *options
+    )
+    assert status == 0, said
+    assert "in an hour with a probability below 1e-12" in " ".join(said.split())
+    show(chromium, page)
+    data: Any = json.loads(chromium.execute_script("return document.getElementById('data').textContent"))
+    own = next(i for i, point in enumerate(data["points"]) if (point["kx"], point["ts"]) == (25.0, 0.005))
+    assert data["points"][own]["p_hour"] == 1.0
+    rarely = min(range(len(data["points"])), key=lambda i: data["points"][i]["p_hour"])
+    outside = next(i for i, point in enumerate(data["points"]) if point["n_any"] == -1)
+
+    def words(at: int) -> str:
+        point = data["points"][at]
+        of_plot(
+            chromium, "p_hour", f"(plot.emit('plotly_click', {{points: [{{x: {point['ts']}, y: {point['kx']}}}]}}), 1)"
+        )
+        return chromium.find_elements("css selector", "#point-values td")[-1].text
+
+    assert chromium.find_element("id", "verdict").text.endswith(
+        "probability to leave the corridor in an hour: above 99.9 %."
+    )
+    assert words(own) == "above 99.9 %"
+    assert words(rarely) == "below 1e-12"
+    assert words(outside) == "1: it is outside even without outages"
 
 
 def test_a_page_without_a_map_is_refused(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
+from agv_analysis.metrics.confidence import computed
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.cannot_say import cannot_say
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
@@ -95,7 +96,7 @@ def test_all_plots_are_drawn_and_the_console_is_silent(shown: Chrome, lap: Analy
     for key in ("track", "time", "outages", "eigenvalues"):
         assert of_plot(shown, key, "plot.querySelectorAll('.main-svg').length") > 0
         assert of_plot(shown, key, "plot.getBoundingClientRect().height") > 300
-    assert "mean-square (by mean square)" in shown.find_element("id", "figures").text
+    assert "Decided by mean square" in shown.find_element("id", "figures").text
     # Where it strays most is marked on the track and over time, and stands in a table.
     worst = [peak.distance for peak in lap.deviation.worst]
     for key in ("track", "time"):
@@ -524,6 +525,14 @@ def test_a_confidence_is_not_rounded_to_certainty() -> None:
     assert confidence_text(0.0000001) == "stable with a probability below 0.1 %"
     assert confidence_text(1.0) == "stable with a probability of 100 %"
     assert confidence_text(0.9566) == "stable with a probability of 95.7 %"
+
+
+@pytest.mark.parametrize(
+    ("probability", "said"),
+    [(1.0, "above 99.9 %"), (0.5, "50 %"), (2e-5, "2e-05"), (2.95e-66, "below 1e-12"), (0.0, "below 1e-12")],
+)
+def test_what_was_computed_is_never_certain(probability: float, said: str) -> None:
+    assert computed(probability) == said
 
 
 def test_a_thinned_line_keeps_its_peaks_and_ends() -> None:

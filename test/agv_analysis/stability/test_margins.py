@@ -184,8 +184,8 @@ def test_which_loss_rate_to_design_with() -> None:
         border = Margin("p_max.twins", "twins", p)
         return dataclasses.replace(found, found={**found.found, "p_max.twins": border}).recommendation
 
-    assert "most simulated twins contract up to 0.93" in with_twins(0.93)
-    assert with_twins(0.7).startswith("a loss rate below 0.7, up to which most simulated twins contract")
+    assert "most simulated runs converge up to 0.93" in with_twins(0.93)
+    assert with_twins(0.7).startswith("a loss rate below 0.7, up to which most simulated runs converge")
     assert of("error_detector.track=line", "controller.kx=401.0").recommendation == ""
 
 
@@ -196,10 +196,10 @@ def test_twins_that_do_not_contract_are_a_disagreement() -> None:
 
     def said(*contraction: float, by: Margins = found, steps: int = 20_000) -> list[str]:
         sentences = dataclasses.replace(by, twins=Twins(np.array(contraction), None, steps)).disagreements()
-        return [sentence for sentence in sentences if "twins" in sentence]
+        return [sentence for sentence in sentences if "neighbouring" in sentence]
 
     assert len(said(2.0)) == len(said(0.5, 0.5, 2.0, math.inf)) == 1
-    assert "2 of 4 contract" in said(0.5, 0.5, 2.0, math.inf)[0]
+    assert "converge in 2 of 4 simulated runs" in said(0.5, 0.5, 2.0, math.inf)[0]
     assert not said(*[0.5] * 9, 2.0)
     assert not said(2.0, steps=100)  # E[e^2] has not died out after half a second
     growing = of("error_detector.track=line", "relay.uplink.model=bernoulli", "relay.uplink.p=0.95")

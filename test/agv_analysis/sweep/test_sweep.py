@@ -368,6 +368,16 @@ def test_the_table_names_its_units_and_fits_80_columns(monkeypatch: pytest.Monke
     assert re.search(r"^ +25 +\d of 2 +\S+ +[\d.]+ \.\. [\d.]+ +47 +0\.00\d+ m$", said, re.MULTILINE), said
 
 
+def test_the_table_of_corridors_names_its_units_and_says_never(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At K_x = 390 nothing settles; at 25 some 500 outages an hour lead outside: that one does is no certainty."""
+    monkeypatch.setenv("COLUMNS", "120")
+    options = ["--set", "plant.duration=5.0", "--vary", "controller.kx=25,390", "--corridor", "0.25", "--laps", "20"]
+    said = CliRunner().invoke(main, ["sweep", "config/outages.yaml", *options, "--no-verdicts"]).output
+    assert re.search(r"kx +outage +outages +a lap +hour +time \[s\]", said), said
+    assert re.search(r"^ +390 .* never ", said, re.MULTILINE), said
+    assert re.search(r"^ +25 .*\) +above 99.9 % +\d", said, re.MULTILINE), said
+
+
 def test_a_cluster_that_is_not_there_is_named() -> None:
     pytest.importorskip("distributed")
     done = CliRunner().invoke(main, ["sweep", PAPER, "--vary", "controller.kx=5,6", "--scheduler", "nonsense://x"])
