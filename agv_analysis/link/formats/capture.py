@@ -15,6 +15,7 @@ import math
 import socket
 from collections import defaultdict
 from collections.abc import Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,11 +90,13 @@ _TOGETHER = 4096
 def _of_one(path: Path, malformed: Malformed, options: Options) -> Measurement:
     numbers: dict[Writer, _Buffered] = defaultdict(lambda: _Buffered(np.int64))
     times: dict[Writer, _Buffered] = defaultdict(lambda: _Buffered(np.float64))
+    begin: Decimal | None = None
     for packet in packets_of(path, malformed, options.progress):
+        begin = packet.time if begin is None else begin
         for writer, number in samples_of(packet.payload):
             if writer[1][-1] in USER_WRITERS:
                 numbers[writer].append(number)
-                times[writer].append(packet.time)
+                times[writer].append(float(packet.time - begin))
     if not numbers:
         raise MeasurementError(
             f"{path}: has no samples of RTPS, whose numbers would say what was lost: give the capture of the other end "
@@ -139,21 +142,25 @@ class _Keyed(NamedTuple):
     key: NDArray[np.uint64]
     """What a packet is known by at both ends: a digest of its samples, or of its bytes; shape (n,)."""
     time: Floats
+    """[s] since `begin`."""
     flow: NDArray[np.int64]
     """Which of the flows it belongs to."""
     flows: list[Flow]
+    begin: Decimal
+    """From when on its times count [s]."""
 
 
-def _keyed(path: Path, malformed: Malformed, progress: Progress | None) -> _Keyed:
+def _keyed(path: Path, malformed: Malformed, progress: Progress | None, begin: Decimal | None = None) -> _Keyed:
     key, time, flow = _Buffered(np.uint64), _Buffered(np.float64), _Buffered(np.int64)
     flows: dict[Flow, int] = {}
     for packet in packets_of(path, malformed, progress):
         samples = tuple(samples_of(packet.payload))
         known_by = repr(samples).encode() if samples else packet.payload
         key.append(int.from_bytes(hashlib.blake2b(known_by, digest_size=8).digest(), "little"))
-        time.append(packet.time)
+        begin = packet.time if begin is None else begin
+        time.append(float(packet.time - begin))
         flow.append(flows.setdefault(packet.flow, len(flows)))
-    return _Keyed(key.values, time.values, flow.values, list(flows))
+    return _Keyed(key.values, time.values, flow.values, list(flows), begin or Decimal())
 
 
 def arrivals(sent: NDArray[np.uint64], arrived: NDArray[np.uint64]) -> NDArray[np.int64]:
@@ -194,7 +201,8 @@ def _arrivals(sent: NDArray[np.uint64], arrived: NDArray[np.uint64]) -> NDArray[
 
 
 def _of_two(path: Path, other: Path, malformed: Malformed, options: Options) -> Measurement:
-    at_sender, at_receiver = _keyed(path, malformed, options.progress), _keyed(other, malformed, options.progress)
+    at_sender = _keyed(path, malformed, options.progress)
+    at_receiver = _keyed(other, malformed, options.progress, at_sender.begin)
     place, flows = arrivals(at_sender.key, at_receiver.key), len(at_sender.flows)
     matched = np.zeros(flows, dtype=np.int64)
     for part in parts(len(place), place, at_sender.flow):

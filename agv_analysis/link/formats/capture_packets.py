@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -34,7 +35,8 @@ Flow = tuple[bytes, int, bytes, int]
 class Packet(NamedTuple):
     """A UDP packet of a capture."""
 
-    time: float
+    time: Decimal
+    """[s] since 1970, as exact as the capture has it."""
     flow: Flow
     """Source, its port, destination, its port."""
     payload: bytes
@@ -60,6 +62,8 @@ def packets_of(path: Path, malformed: Malformed, progress: Progress | None) -> I
             reader = dpkt.pcap.UniversalReader(watched := _Watched(file))
         except (ValueError, dpkt.Error) as error:
             raise MeasurementError(f"{path}: is no capture: {error}") from None
+        if hasattr(reader, "_divisor"):  # else its stamps are floats, which are exact to 0.2 us
+            reader._divisor = Decimal(reader._divisor)
         decode, number = _decoder(dpkt, reader.datalink(), path), 0
         try:
             for time, data in reader:
@@ -76,7 +80,7 @@ def packets_of(path: Path, malformed: Malformed, progress: Progress | None) -> I
                 ip = packet if isinstance(packet, (dpkt.ip.IP, dpkt.ip6.IP6)) else getattr(packet, "data", None)
                 udp = getattr(ip, "data", None)
                 if isinstance(udp, dpkt.udp.UDP):
-                    yield Packet(float(time), (ip.src, udp.sport, ip.dst, udp.dport), bytes(udp.data))  # type: ignore[union-attr]
+                    yield Packet(Decimal(time), (ip.src, udp.sport, ip.dst, udp.dport), bytes(udp.data))  # type: ignore[union-attr]
         except (dpkt.Error, struct.error, ValueError):
             watched.is_short = True
         if watched.is_short:

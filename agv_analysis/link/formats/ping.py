@@ -57,6 +57,8 @@ class _Found:
     has_header: bool = False
     is_busybox: bool | None = None
     transmitted: int | None = None
+    stamped_from: int | None = None
+    """The second of the first time stamp, from which on the others count."""
     total: float | None = None
     """Time of the whole run by the summary [s]."""
     below: int = 0
@@ -89,7 +91,10 @@ def _read_block(block: Block, found: _Found, path: Path) -> None:
     first = _after_stamp(block)
     stamped = text[block.starts] == ord("[")
     stamp = np.full(lines, np.nan)
-    stamp[stamped] = numbers_at(text, block.starts[stamped] + 1, commas=True).values
+    stamps = numbers_at(text, block.starts[stamped] + 1, commas=True)
+    if found.stamped_from is None and (stamps.length > 0).any():
+        found.stamped_from = int(stamps.values[stamps.length > 0][0])
+    stamp[stamped] = stamps.beyond(found.stamped_from or 0)
     letter = text[first]
     is_reply = (letter >= ord("0")) & (letter <= ord("9"))
     has_ttl = np.zeros(lines, dtype=np.bool_)

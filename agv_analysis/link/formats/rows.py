@@ -52,32 +52,32 @@ _NOTHING = (b"", b"nan", b"na", b"n/a", b"null", b"none", b"-", b".", b"*", b"lo
 
 
 def floats_at(
-    text: Bytes, begins: Places, ends: Places, commas: bool = False
+    text: Bytes, begins: Places, ends: Places, commas: bool = False, origin: int = 0
 ) -> tuple[Floats, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
     """The numbers between these places, shape (n,), and whether each is one; NaN is, and so is nothing at all.
 
-    `commas`: a comma is a decimal mark, too.
+    `commas`: a comma is a decimal mark, too. `origin`: they are told by how much they are more than this.
     """
     negative = text[np.minimum(begins, len(text) - 1)] == ord("-")
     numbers = numbers_at(text, begins + negative, commas)
     is_sound = numbers.length - (numbers.decimals > 0) <= _MOST_DIGITS
     is_sound &= (numbers.digits > 0) | (text.take(begins + negative, mode="clip") == ord("0"))  # a point alone is none
-    values, good = numbers.values, is_sound & (numbers.length == ends - begins - negative)
+    values, good = numbers.beyond(origin), is_sound & (numbers.length == ends - begins - negative)
     others = np.flatnonzero(~good)
     if len(others):
         rows = others[is_sound[others] & (numbers.length[others] > 0)]
         scaled, fine = _scaled(text, (begins + negative)[rows], ends[rows], numbers.taken(rows))
-        values[rows[fine]], good[rows[fine]] = scaled[fine], True
+        values[rows[fine]], good[rows[fine]] = scaled[fine] - origin, True
         others = np.flatnonzero(~good)
     if negative.any():
-        values[negative] *= -1.0
+        values[negative] = -(values[negative] + origin) - origin
     if len(others):
         words = cells(text, begins[others], ends[others])
         empty = np.isin(np.char.lower(words), _NOTHING)
         values[others[empty]], good[others[empty]] = np.nan, True
         for i, word in zip(others[~empty].tolist(), words[~empty].tolist(), strict=True):
             try:
-                values[i], good[i] = float(word.replace(b",", b".") if commas else word), True
+                values[i], good[i] = float(word.replace(b",", b".") if commas else word) - origin, True
             except ValueError:
                 values[i] = np.nan
     return values, good

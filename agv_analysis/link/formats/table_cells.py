@@ -29,13 +29,13 @@ def trimmed(text: Bytes, begins: Places, ends: Places) -> tuple[Places, Places]:
     return begins, ends
 
 
-def flags_at(text: Bytes, begins: Places, ends: Places, commas: bool = False) -> tuple[Floats, Flags]:
+def flags_at(text: Bytes, begins: Places, ends: Places, commas: bool = False, origin: int = 0) -> tuple[Floats, Flags]:
     """As `floats_at`; words that mean yes or lost become 1, words that mean no or received 0."""
     letters = text[np.minimum(begins, len(text) - 1)]
     is_word = ((letters >= ord("A")) & (begins < ends)) & ~np.isin(letters, np.frombuffer(b"nN", dtype=np.uint8))
     is_word |= np.isin(letters, np.frombuffer(b"nN", dtype=np.uint8)) & (ends - begins <= 2)  # n, no
     values, good = np.full(len(begins), np.nan), np.zeros(len(begins), dtype=np.bool_)
-    values[~is_word], good[~is_word] = floats_at(text, begins[~is_word], ends[~is_word], commas)
+    values[~is_word], good[~is_word] = floats_at(text, begins[~is_word], ends[~is_word], commas, origin)
     at = np.flatnonzero(is_word)
     if len(at):
         words = np.char.lower(cells(text, begins[at], ends[at]))
@@ -60,10 +60,11 @@ def is_date(text: Bytes, begins: Places, ends: Places) -> Flags:
     return np.asarray(found)
 
 
-def dates_at(text: Bytes, begins: Places, ends: Places, commas: bool = False) -> tuple[Floats, Flags]:
-    """Dates of ISO 8601 with a time, as 2024-05-01T12:00:00.25+02:00, in seconds since 1970, and which are some.
+def dates_at(text: Bytes, begins: Places, ends: Places, commas: bool = False, origin: int = 0) -> tuple[Floats, Flags]:
+    """Dates of ISO 8601 with a time, as 2024-05-01T12:00:00.25+02:00, and which are some.
 
-    Without a zone they are taken as they stand: only their differences matter.
+    In seconds since `origin`, which is in seconds since 1970. Without a zone they are taken as they stand: only their
+    differences matter.
     """
     good = is_date(text, begins, ends)
     values = np.full(len(begins), np.nan)
@@ -85,7 +86,8 @@ def dates_at(text: Bytes, begins: Places, ends: Places, commas: bool = False) ->
     behind = at + len(_DATE) + seconds.length
     zone, whole = _zones(text, behind, ends[good])
     is_real &= whole & (seconds.length >= 2)
-    found = days * _DAY + number(11, 2) * 3600.0 + number(14, 2) * 60.0 + seconds.values - zone
+    minutes = days * _DAY + number(11, 2) * 3600.0 + number(14, 2) * 60.0 - zone - origin
+    found = minutes + seconds.values  # whole numbers first, which are exact
     values[good] = np.where(is_real, found, np.nan)
     good[good] = is_real
     return values, good

@@ -28,6 +28,12 @@ from agv_analysis.run import Floats
 Part = dict[str, NDArray[np.float64]]
 """Columns of a block by role, of the rows that were understood; NaN where a cell is empty."""
 
+_LONG_AGO = 1e6
+"""Times of more seconds than this count from about the first one: floats of seconds since 1970 are exact to 0.2 us."""
+
+_BEFORE = 10
+"""So many seconds before the first one, so that none becomes a 0 or 1, which may be yes or no."""
+
 _DATES = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 """From which number on since 1970 it is one of units [s] smaller than a second: 1e11 s are more than 3000 years."""
 
@@ -46,6 +52,8 @@ class TableRows:
         """Cells with a time that no packet takes."""
         self._dated: dict[str, bool] = {}
         self._units: dict[str, float] = {}
+        self._origin: int | None = None
+        self._origins: dict[str, int] = {}
         if not is_enough(self.roles):
             raise MeasurementError(
                 f"{path}: no column says which packets were lost; it has {', '.join(self.header.names)}: name one with "
@@ -93,29 +101,57 @@ class TableRows:
         self, text: Bytes, begins: Places, ends: Places, column: TableColumn
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """The cells of a column as numbers, NaN for an empty one, and which of them are in order."""
-        if column.role in INSTANTS and self._is_dated(text, begins, ends, column.role):
-            values, good = dates_at(text, begins, ends, self.header.may_have_commas)
-            return values, good | (begins == ends)
+        if column.role in INSTANTS:
+            return self._instants(text, begins, ends, column)
         read = flags_at if column.role in FLAGS else floats_at
         values, good = read(text, begins, ends, self.header.may_have_commas)
-        values *= self._unit(column, values)
-        if column.role in INSTANTS:
-            return values, good & ~np.isinf(values)
+        values *= column.unit
         is_none = np.isinf(values) | ((values < 0.0) & (column.role == "rtt"))
         self.impossible += int(np.count_nonzero(is_none))
         values[is_none] = np.nan
         return values, good
 
-    def _unit(self, column: TableColumn, values: Floats) -> float:
-        """What a number of a column is worth [s]: what its name says, else what makes a date of its first one."""
-        if column.unit != 1.0 or column.role not in INSTANTS:
-            return column.unit
-        if column.role not in self._units:
-            held = values[np.isfinite(values)][:1]
-            if not len(held):
-                return column.unit
+    def _instants(
+        self, text: Bytes, begins: Places, ends: Places, column: TableColumn
+    ) -> tuple[Floats, NDArray[np.bool_]]:
+        """As `_values`, of a column of times: in seconds since the origin, the same of all columns."""
+        role, commas = column.role, self.header.may_have_commas
+        if self._is_dated(text, begins, ends, role):
+            if self._origin is None:
+                self._begin_at(dates_at(text, begins, ends, commas)[0])
+            values, good = dates_at(text, begins, ends, commas, self._origin or 0)
+            return values, good | (begins == ends)
+        read = flags_at if role in FLAGS else floats_at
+        if role not in self._origins:
+            self._scale(column, read(text, begins, ends, commas)[0])
+        values, good = read(text, begins, ends, commas, self._origins.get(role, 0))
+        values *= self._unit(column)
+        return values, good & ~np.isinf(values)
+
+    def _scale(self, column: TableColumn, values: Floats) -> None:
+        """Take from the first number of a column of times its unit and, in that unit, the origin."""
+        held = values[np.isfinite(values)][:1]
+        if not len(held):
+            return
+        if column.unit == 1.0:
             self._units[column.role] = next((unit for least, unit in _DATES if held[0] >= least), 1.0)
-        return self._units[column.role]
+        if column.role in FLAGS and held[0] in (0.0, 1.0):  # no time, but yes or no
+            self._origins[column.role] = 0
+            return
+        unit = self._unit(column)
+        if self._origin is None:
+            self._begin_at(held * unit)
+        self._origins[column.role] = (self._origin or 0) * round(1.0 / unit)
+
+    def _begin_at(self, times: Floats) -> None:
+        """Tell times from about the first one on [s], if they are dates or as long."""
+        held = times[np.isfinite(times)][:1]
+        if len(held):
+            self._origin = int(held[0]) - _BEFORE if held[0] >= _LONG_AGO else 0
+
+    def _unit(self, column: TableColumn) -> float:
+        """What a number of a column is worth [s]: what its name says, else what makes a date of its first one."""
+        return column.unit if column.unit != 1.0 else self._units.get(column.role, 1.0)
 
     def _is_dated(self, text: Bytes, begins: Places, ends: Places, role: str) -> bool:
         """Does the first cell of a column that holds something hold a date?"""

@@ -33,6 +33,9 @@ _DIGITS = 24
 
 _POWERS = 10.0 ** np.arange(_DIGITS + 1)
 
+_WHOLE_POWERS = 10 ** np.arange(19, dtype=np.int64)
+"""Those that an integer of 64 bits holds."""
+
 _POINT, _COMMA = (np.uint8((ord(mark) - ord("0")) % 256) for mark in ".,")
 """Decimal marks, counted from the digit 0 on."""
 
@@ -139,6 +142,21 @@ class Numbers(NamedTuple):
         """As floats, NaN where there is no number: exact up to 15 digits."""
         found = self.digits.astype(np.float64)
         found /= _POWERS[self.decimals]
+        found[self.length == 0] = np.nan
+        return found
+
+    def beyond(self, origin: int) -> Floats:
+        """By how much they are more than a whole number, NaN where there is no number: exact up to 19 digits.
+
+        A float of seconds since 1970 is only exact to 0.2 us.
+        """
+        if not origin:
+            return self.values
+        shifted = origin * _WHOLE_POWERS[np.minimum(self.decimals, len(_WHOLE_POWERS) - 1)]
+        found = (self.digits.astype(np.int64) - shifted).astype(np.float64)  # what is more than 64 bits cancels out
+        found /= _POWERS[self.decimals]
+        is_long = self.decimals >= len(_WHOLE_POWERS)
+        found[is_long] = self.values[is_long] - origin
         found[self.length == 0] = np.nan
         return found
 

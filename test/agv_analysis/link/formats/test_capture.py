@@ -109,6 +109,42 @@ def test_captures_of_both_ends_are_matched(tmp_path: Path, is_rtps: bool) -> Non
     assert "from 10.0.0.1:5000 to 10.0.0.2:7411" in found.notes[0]
 
 
+def capture_of(path: Path, packets: Sequence[tuple[int, bytes]], kind: str) -> Path:
+    """A capture with stamps [ns] since 1970 as pcap in ns or us, or as pcapng in ns."""
+    if kind == "pcapng":
+
+        def block(number: int, body: bytes) -> bytes:
+            body += b"\x00" * (-len(body) % 4)
+            length = struct.pack("<I", len(body) + 12)
+            return struct.pack("<I", number) + length + body + length
+
+        text = block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+        text += block(1, struct.pack("<HHI", 1, 0, 65535) + struct.pack("<HHB3xHH", 9, 1, 9, 0, 0))
+        for at, data in packets:
+            text += block(6, struct.pack("<IIIII", 0, at >> 32, at & 0xFFFFFFFF, len(data), len(data)) + data)
+    else:
+        unit, magic = (1, 0xA1B23C4D) if kind == "ns" else (1000, 0xA1B2C3D4)
+        text = struct.pack("<IHHIIII", magic, 2, 4, 0, 0, 65535, 1)
+        for at, data in packets:
+            text += struct.pack("<IIII", at // 10**9, at % 10**9 // unit, len(data), len(data)) + data
+    path.write_bytes(text)
+    return path
+
+
+@pytest.mark.parametrize(("kind", "late"), [("us", 123_000), ("ns", 123_457), ("pcapng", 123_457)])
+def test_stamps_of_a_capture_are_as_exact_as_it_has_them(tmp_path: Path, kind: str, late: int) -> None:
+    """A float of seconds since 1970 is only exact to 0.2 us."""
+    begin, step = 1_700_000_000_999_123_000, 2_000_000
+    here = [(begin + i * step, frame(rtps(i + 1))) for i in range(N)]
+    there = [(at + late, data) for i, (at, data) in enumerate(here) if i not in LOST]
+    received = capture_of(tmp_path / "received", there, kind)
+    found = measured(capture_of(tmp_path / "sent", here, kind), Options(received=received))
+    expected = [1e-9 * late if i not in LOST else float("nan") for i in range(N)]
+    assert found.whole.delay == pytest.approx(expected, abs=1e-12, nan_ok=True)
+    assert found.sent == pytest.approx([0.002 * i for i in range(N)], abs=1e-12)
+    assert measured(received).sent == pytest.approx([0.002 * i for i in range(N)], abs=1e-12)
+
+
 def test_a_capture_that_says_nothing_of_losses_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "x.pcap", [(1.0, frame(b"no numbers"))])
     with pytest.raises(MeasurementError, match="has no samples of RTPS"):

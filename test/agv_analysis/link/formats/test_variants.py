@@ -403,6 +403,50 @@ def test_a_date_in_smaller_units_is_one_and_that_is_said(tmp_path: Path) -> None
     )
 
 
+@pytest.mark.parametrize("form", ["ping", "table", "units", "dates", "late"])
+def test_stamps_of_today_are_as_exact_as_they_are_written(tmp_path: Path, form: str) -> None:
+    """A float of seconds since 1970 is only exact to 0.2 us: packets 2 ms apart, 123.457 us under way."""
+    sent = [1_700_000_000_999_123_000 + 2_000_000 * k for k in range(50)]  # ns
+    arrived = [at + 123_457 for at in sent]
+    gone = {10, 11, 30}
+
+    def seconds(at: int) -> str:
+        return f"{at // 10**9}.{at % 10**9:09d}"
+
+    def date(at: int) -> str:
+        whole = at // 10**9 - 1_700_000_000  # since 22:13:20
+        return f"2023-11-14T22:{13 + (20 + whole) // 60:02d}:{(20 + whole) % 60:02d}.{at % 10**9:09d}Z"
+
+    every = [(k, a, b) for k, (a, b) in enumerate(zip(sent, arrived, strict=True))]
+    rows = [row for row in every if row[0] not in gone]
+    text = {
+        "ping": "PING 10.0.0.2 (10.0.0.2) 56(84) bytes of data.\n" + "".join(
+            f"[{seconds(b)}] 64 bytes from 10.0.0.2: icmp_seq={k + 1} ttl=64 time=0.123457 ms\n" for k, a, b in rows
+        ),
+        "table": "seq,sent,received\n" + "".join(f"{k},{seconds(a)},{seconds(b)}\n" for k, a, b in rows),
+        "units": "seq,sent_ns,received_ms\n" + "".join(f"{k},{a},{b // 10**6}.{b % 10**6:06d}\n" for k, a, b in rows),
+        "dates": "received;seq;sent\n" + "".join(f"{date(b)};{k};{date(a)}\n" for k, a, b in rows),
+        "late": "sent,received\n" + "".join(
+            f"{seconds(a)},{'' if k in gone else seconds(b)}\n" for k, a, b in every
+        ),
+    }[form]  # fmt: skip
+    found = read(tmp_path / "log", text)
+    assert lost(found) == sorted(gone)
+    assert found.sent == pytest.approx([0.002 * k for k in range(50)], abs=1e-12)
+    expected = [NAN if k in gone else 123.457e-6 for k in range(50)]
+    assert delays(found) == pytest.approx(expected, abs=1e-12, nan_ok=True)
+
+
+def test_times_of_arrival_in_whole_seconds_are_no_yes_and_no(tmp_path: Path) -> None:
+    text = "seq,received\n" + "".join(f"{k},{1_700_000_000 + k // 5}\n" for k in range(10) if k != 3)
+    found = read(tmp_path / "log", text)
+    assert (found.packets, lost(found)) == (10, [3])
+    flags = "time,received\n" + "".join(f"{1_700_000_000 + k}.25,{int(k != 3)}\n" for k in range(10))
+    assert lost(read(tmp_path / "flags", flags)) == [3]
+    swapped = "received,time\n" + "".join(f"{int(k != 3)},{1_700_000_000 + k}.25\n" for k in range(10))
+    assert lost(read(tmp_path / "swapped", swapped)) == [3]
+
+
 def test_stamps_that_are_coarser_than_packets_are_apart(tmp_path: Path) -> None:
     found = read(
         tmp_path / "a", "time,lost\n" + "".join(f"{1000 + i // 10},{int(i in (34, 35))}\n" for i in range(100))
