@@ -119,6 +119,8 @@ def read_netem(line: str, channel: ChannelParameters) -> tuple[ChannelParameters
 def is_netem(text: str) -> bool:
     """Does a text look like a line for netem?"""
     words = text.split()
+    while len(words) > 2 and words[0] in _SKIPPED:
+        del words[: 1 + _SKIPPED[words[0]]]
     if not words or len(text) > 2000:
         return False
     return "netem" in words or (
@@ -139,6 +141,10 @@ def _loss(line: _Line, channel: ChannelParameters, differences: list[str]) -> Ch
     if kind == "state":
         return _states(shares, channel, differences)
     probability, correlation = (*map(float, shares), 0.0)[:2]
+    if correlation >= 1.0:
+        raise NetemError(
+            f"netem: losses that are correlated by 100% are all or none, forever, in {line.text.strip()!r}"
+        )
     if correlation == 0.0:
         return dataclasses.replace(channel, model="bernoulli", p=probability)
     rate, burst = correlated_loss(probability, correlation)
@@ -190,8 +196,6 @@ def four_states(p13: float, p31: float, p32: float, p23: float, p14: float) -> C
 
 def correlated_loss(p: float, rho: float) -> tuple[float, float]:
     """Loss rate and mean burst of x' = (1 - rho) u + rho x, a packet being lost where x < p; on a grid of x."""
-    if rho >= 1.0:
-        return p, math.inf if p else 1.0
     x = (np.arange(_GRID) + 0.5) / _GRID
     edges = np.arange(_GRID + 1) / _GRID
     below = np.clip((edges[None, :] - rho * x[:, None]) / (1.0 - rho), 0.0, 1.0)
@@ -263,8 +267,8 @@ def _gap(line: _Line, channel: ChannelParameters, differences: list[str]) -> Cha
 
 def _rate(line: _Line, channel: ChannelParameters, differences: list[str]) -> ChannelParameters:
     rate = line.take() if line.words else ""
-    while line.words and re.fullmatch(r"-?\d+", line.words[0]):
-        line.take()  # overhead of packets and cells
+    while line.words and re.fullmatch(r"-?\d+|packetoverhead|cellsize|celloverhead", line.words[0]):
+        line.take()  # numbers, which `tc qdisc show` names
     differences.append(f"rate {rate}: a packet takes its length over the rate longer in netem; left out here")
     return channel
 

@@ -255,6 +255,11 @@ def _numbered(source: str, found: PacketGrid, delays: Sequence[str], rows: Table
     if found.dated < 2:
         notes.append(_undated(options))
     grid = found.whole(options.interval or 1.0)
+    if 2 * grid.duplicates > found.records - grid.duplicates:
+        notes.append(
+            f"{grid.duplicates} rows have the number of an earlier one: if they are answers, what was lost does not "
+            "show, and a table of one direction is needed"
+        )
     if found.dated >= 2:
         notes += _spread(grid.sent, options)
     delay = dict(zip(delays, grid.delays, strict=True))

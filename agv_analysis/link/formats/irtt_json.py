@@ -50,7 +50,8 @@ from agv_analysis.run import Floats
 _BEGIN = re.compile(rb'"round_trips"\s*:\s*\[')
 _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\\?\Z)', re.DOTALL)
 """A string of JSON, which may be cut."""
-_INTERVAL = re.compile(rb'"interval"\s*:\s*(\d+)')
+_STATED = tuple(re.compile(rb'"%b"\s*:\s*(\d+)' % name) for name in (b"interval", b"duplicates", b"late_packets"))
+"""What irtt says before the round trips, which have none of them: replies that came twice, or behind a later one."""
 _NS = 1e-9
 _BATCH, _LARGE_BATCH = 1 << 16, 1 << 18
 """Bytes that are read at a time, more of members that are written alike: what becomes of them fits the cache."""
@@ -98,7 +99,7 @@ class _Table:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed, table, stated, number = Malformed(), _Table(), [0.0], 0
+    malformed, table, stated, number = Malformed(), _Table(), [0, 0, 0], 0
     decode, shapes = _decoder(), Shapes(_trip) if HAS_NUMBA and path.stat().st_size > _MANY else None
     size = _BATCH if shapes is None else _LARGE_BATCH
     for batch in _batches(path, options.progress, malformed, stated, size):
@@ -121,8 +122,9 @@ def _read(path: Path, options: Options) -> Measurement:
             number += len(trips)
         table.extend(trips)
     if not len(table.seq):
-        raise MeasurementError(f"{path}: has no round trips: was irtt stopped before it wrote them?")
-    return _measurement(str(path), table, malformed, stated[0], options)
+        why = "; ".join(malformed.sentences()) or "was irtt stopped before it wrote them?"
+        raise MeasurementError(f"{path}: has no round trips: {why}")
+    return _measurement(str(path), table, malformed, stated, options)
 
 
 def _without_alike(batch: bytes, shapes: Shapes, table: _Table) -> tuple[bytes, int]:
@@ -140,9 +142,9 @@ def _without_alike(batch: bytes, shapes: Shapes, table: _Table) -> tuple[bytes, 
 
 
 def _batches(
-    path: Path, progress: Progress | None, malformed: Malformed, stated: list[float], size: int
+    path: Path, progress: Progress | None, malformed: Malformed, stated: list[int], size: int
 ) -> Iterator[bytes]:
-    """Members of `round_trips`, some at a time, with the commas between them. Into `stated` the interval [s]."""
+    """Members of `round_trips`, some at a time, with the commas between them. Into `stated` what `_STATED` says."""
     text, began = b"", False
     for chunk in chunks(path, progress, size):
         text += chunk
@@ -150,8 +152,8 @@ def _batches(
             begin = _BEGIN.search(text)
             if begin is None:
                 continue
-            interval = _INTERVAL.search(text[: begin.start()])
-            stated[0] = 0.0 if interval is None else int(interval[1]) * _NS
+            before = [pattern.search(text, 0, begin.start()) for pattern in _STATED]
+            stated[:] = [0 if one is None else int(one[1]) for one in before]
             text, began = text[begin.end() :], True
         end = _end(text)
         at = _last_begin(text) if end is None else end
@@ -284,16 +286,16 @@ def _decode_as_json(batch: bytes) -> list[Trip] | None:
     return None if None in found else found  # type: ignore[return-value]
 
 
-def _measurement(source: str, table: _Table, malformed: Malformed, stated: float, options: Options) -> Measurement:
+def _measurement(source: str, table: _Table, malformed: Malformed, stated: list[int], options: Options) -> Measurement:
     seq, word, notes = table.seq.values, table.word.values, []
     delays, stamps = [column.values for column in table.delays], [column.values for column in table.stamps]
-    duplicates = reordered = 0
+    _, duplicates, reordered = stated
     kept = firsts_in_order(seq)
     if kept is not None:
-        reordered = sum(
+        reordered += sum(
             int(np.count_nonzero(np.diff(kept[part.start : part.stop + 1]) < 0)) for part in parts(len(kept) - 1, kept)
         )
-        duplicates = len(seq) - len(kept)
+        duplicates += len(seq) - len(kept)
         seq, word = reordered_by(seq, kept), reordered_by(word, kept)
         delays, stamps = (
             [reordered_by(column, kept) for column in delays],
@@ -317,7 +319,7 @@ def _measurement(source: str, table: _Table, malformed: Malformed, stated: float
     found = [None if is_all_nan(delay) else delay for delay in delays]
     if found[0] is not None:
         notes.append("delays of each direction are as good as the two clocks agree")
-    sent, said = _times(seq, stamps, options.interval or stated)
+    sent, said = _times(seq, stamps, options.interval or stated[0] * _NS)
     return Measurement(
         source=source, format="irtt", sent=sent, uplink=PacketOutcomes(up, found[0]),
         downlink=PacketOutcomes(down, found[1]), round_trip=PacketOutcomes(whole, found[2]), duplicates=duplicates,

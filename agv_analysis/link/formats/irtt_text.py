@@ -31,6 +31,8 @@ _LINE = re.compile(rb"^seq=\d+ rtt=-?[\d.]+", re.MULTILINE)
 _OTHER = re.compile(rb"\[.*\] .*|DUP! seq=\d+|\s.*|.*(stats|rate|loss|duration|pkts|sent/received|Min|---|RTT).*")
 """Lines that say nothing of a reply: events, duplicates, and the table at the end, which is set to the right."""
 
+_SENT = re.compile(rb"\s*packets sent/received: (\d+)/\d+")
+
 _USUAL_INTERVAL = 1.0
 """Time between packets that irtt takes without -i [s]."""
 
@@ -42,19 +44,20 @@ def _matches(head: bytes, path: Path) -> bool:
 
 
 def _read(path: Path, options: Options) -> Measurement:
-    malformed, found, duplicates = Malformed(), PacketGrid(delays=3), 0
+    malformed, found, duplicates, sent = Malformed(), PacketGrid(delays=3), 0, 0
     for block in blocks(path, options.progress):
-        table, again = _table(block, malformed)
+        table, again, stated = _table(block, malformed)
         found.add(table[:, 0].astype(np.int64), tuple(table[:, i] for i in (1, 2, 3)))
-        duplicates += again
+        duplicates, sent = duplicates + again, max(sent, stated)
     needs_packets(found.records, str(path), "line of a reply", malformed)
     interval = options.interval or _USUAL_INTERVAL
     assumed = "as --interval says" if options.interval else "irtt's usual, is assumed; say otherwise with --interval"
+    unknown = "" if sent else "packets after the last reply are unknown, and "
     notes = (
         f"the lines do not say when packets were sent: {interval:g} s between them, {assumed}",
-        "packets after the last reply are unknown, and on which way a packet was lost",
+        f"{unknown}on which way a packet was lost" + (" is not known" if sent else ""),
     )
-    grid = found.whole(interval, first=0)
+    grid = found.whole(interval, first=0, last=max(found.last, sent - 1))
     rtt, up, down = grid.delays
     either = of_one_way(grid.outcome)
     directions = [PacketOutcomes(either, None if is_all_nan(delay) else delay) for delay in (up, down)]
@@ -65,8 +68,11 @@ def _read(path: Path, options: Options) -> Measurement:
     )  # fmt: skip
 
 
-def _table(block: Block, malformed: Malformed) -> tuple[Floats, int]:
-    """Number and delays rtt, sd, rd [s] of each reply of a block, shape (n, 4); how many lines are of duplicates."""
+def _table(block: Block, malformed: Malformed) -> tuple[Floats, int, int]:
+    """Number and delays rtt, sd, rd [s] of each reply of a block, shape (n, 4).
+
+    Then how many lines are of duplicates, and how many packets were sent by the table at the end, 0 if it is not there.
+    """
     text, lines = block.text, len(block.starts)
     signs = np.flatnonzero(text == ord("="))
     at_seq = signs[is_preceded_by(text, signs, b"seq")]
@@ -78,13 +84,15 @@ def _table(block: Block, malformed: Malformed) -> tuple[Floats, int]:
         at = signs[is_preceded_by(text, signs, b" " + name)]
         table[block.line_of(at), column] = _durations(text, at + 1)
     whole = ~np.isnan(table[:, 0]) & ~np.isnan(table[:, 1])
-    duplicates = 0
+    duplicates = sent = 0
     for i in np.flatnonzero(~whole).tolist():
         line = block.line(i)
         duplicates += line.startswith(b"DUP!")
+        stated = _SENT.match(line)
+        sent = sent if stated is None else int(stated[1])
         if line.strip() and not _OTHER.fullmatch(line):
             malformed.add(block.number + i, line)
-    return table[whole], duplicates
+    return table[whole], duplicates, sent
 
 
 def _durations(text: Bytes, places: Places) -> Floats:

@@ -30,7 +30,7 @@ _USUAL_INTERVAL = 1.0
 
 _HEADER = re.compile(rb"PING6?[\s(]")
 _SUMMARY = re.compile(
-    rb"[^\d%]*(\d+)[^\d,%]*(?:,|\xef\xbc\x8c|\xe3\x80\x81)[^\d%]*\d+[^\d%].*[^\w:.][\d.]+ ?%"
+    rb"[^\d%]*(\d+)[^\d,%]*(?:,|\xef\xbc\x8c|\xe3\x80\x81)[^\d%]*(\d+)[^\d%].*[^\w:.][\d.]+ ?%"
     rb"[^,]*(?:, ?[^\d,]*(\d+) ?(?:ms|[\x80-\xff]))?"
 )
 """The same in every language: packets sent, received, a percentage, and perhaps the time; commas may be Chinese."""
@@ -57,6 +57,8 @@ class _Found:
     has_header: bool = False
     is_busybox: bool | None = None
     transmitted: int | None = None
+    received: int | None = None
+    """By the summary, both."""
     stamped_from: int | None = None
     """The second of the first time stamp, from which on the others count."""
     total: float | None = None
@@ -73,6 +75,9 @@ def _read(path: Path, options: Options) -> Measurement:
     found = _Found()
     for block in blocks(path, options.progress):
         _read_block(block, found, path)
+    if found.begin is None and found.received == 0 and found.transmitted:  # whose lines are not needed
+        found.begin = 1
+        found.grid.mention(np.arange(1, found.transmitted + 1))
     if found.begin is None:
         only = ": it has the summary alone; run ping without -q and -f" if found.transmitted is not None else ""
         raise MeasurementError(f"{path}: has no line of a packet{only}")
@@ -164,8 +169,8 @@ def _read_other(block: Block, i: int, found: _Found, path: Path) -> None:
         return
     summary = _SUMMARY.match(line)
     if summary is not None:
-        found.transmitted = int(summary[1])
-        found.total = None if summary[2] is None else int(summary[2]) * 1e-3
+        found.transmitted, found.received = int(summary[1]), int(summary[2])
+        found.total = None if summary[3] is None else int(summary[3]) * 1e-3
         return
     if line.strip() and not _OTHER.fullmatch(line.strip()):
         found.malformed.add(block.number + i, line)

@@ -40,6 +40,18 @@ def test_what_ours_can_is_exact() -> None:
     assert read("delay 250usec")[0].delay == pytest.approx(250e-6)
 
 
+def test_options_that_say_nothing_of_a_message_may_stand_anywhere(tmp_path: Path) -> None:
+    found, differences = read(
+        "qdisc netem 1: dev lo root rate 1Mbit packetoverhead 20 cellsize 53 celloverhead 5 loss 5%"
+    )
+    assert (found.p, len(differences)) == (0.05, 1)
+    path = tmp_path / "netem.txt"
+    path.write_text("limit 1000 seed 3 delay 5ms loss 1% ecn\n")
+    setting = read_link(path)
+    assert isinstance(setting, Setting)
+    assert (setting.channel.delay, setting.channel.p, setting.differences) == (0.005, 0.01, ())
+
+
 def test_what_ours_cannot_is_said() -> None:
     line = "delay 20ms 5ms 25% distribution normal loss 5% 25% reorder 25% 50% gap 5 rate 1mbit corrupt 0.1%"
     found, differences = read(line)
@@ -113,7 +125,7 @@ def test_four_states_are_those_of_the_kernel() -> None:
     assert "four states" in differences[0]
 
 
-@pytest.mark.parametrize("line", ["loss", "loss 101%", "netem", "delay fast", "lose 5%", "limit 1000"])
+@pytest.mark.parametrize("line", ["loss", "loss 101%", "netem", "delay fast", "lose 5%", "limit 1000", "loss 5% 100%"])
 def test_what_netem_would_not_take_is_refused(line: str) -> None:
     with pytest.raises(NetemError):
         read(line)

@@ -137,6 +137,18 @@ def test_ping_with_all_that_may_be_on_its_lines(tmp_path: Path) -> None:
     assert "1 replies took less than the time that is printed" in said(found)
 
 
+@pytest.mark.parametrize("errors", ["", "+3 errors, "])
+def test_a_summary_by_which_all_was_lost_is_enough(tmp_path: Path, errors: str) -> None:
+    text = (
+        "PING 10.0.0.2 (10.0.0.2) 56(84) bytes of data.\n\n--- 10.0.0.2 ping statistics ---\n"
+        f"5 packets transmitted, 0 received, {errors}100% packet loss, time 800ms\n\n"
+    )
+    found = read(tmp_path / "a", text)
+    assert (lost(found), found.whole.is_told) == ([0, 1, 2, 3, 4], True)
+    assert found.interval == pytest.approx(0.2)
+    assert delays(found) == pytest.approx([NAN] * 5, nan_ok=True)
+
+
 def test_two_runs_of_ping_in_one_file_are_refused(tmp_path: Path) -> None:
     run = "PING x (1.2.3.4) 56(84) bytes of data.\n64 bytes from 1.2.3.4: icmp_seq=1 ttl=64 time=1.0 ms\n\n"
     with pytest.raises(MeasurementError, match=r"a:4: another run begins: give each run of ping its own file"):
@@ -190,6 +202,30 @@ def test_irtt_text_with_what_it_prints_before_and_between(tmp_path: Path) -> Non
         "[[fe80::1]:2112] [WaitForPackets] waiting 1s for final packets\nseq=2 rtt=900µs\nseq 3\n",
     )
     assert (lost(found), found.malformed.shown) == ([1], ["line 6: 'seq 3'"])
+    assert "packets after the last reply are unknown" in said(found)
+
+
+def test_the_table_below_irtt_text_says_how_many_packets_were_sent(tmp_path: Path) -> None:
+    text = (
+        "seq=0 rtt=1.02ms rd=0.5ms sd=0.52ms ipdv=n/a\nseq=2 rtt=900µs rd=400µs sd=500µs ipdv=4.2ms\n\n"
+        "                duration: 1.01s (wait 139.9ms)\n   packets sent/received: 5/2 (60.00% loss)\n"
+        " server packets received: 4/5 (20.00%/50.00% loss up/down)\n"
+    )
+    found = read(tmp_path / "a", text)
+    assert (lost(found), found.packets, found.malformed.count) == ([1, 3, 4], 5, 0)
+    assert "packets after" not in said(found)
+
+
+def test_irtt_states_what_came_twice_or_late(tmp_path: Path) -> None:
+    trips: list[object] = [{"seqno": i, "lost": "false", "delay": {"rtt": 1_000_000 + i}} for i in range(6)]
+    text = irtt(trips).replace('"round_trips"', '"stats": {"duplicates": 2, "late_packets": 3}, "round_trips"', 1)
+    found = read(tmp_path / "a", text)
+    assert (found.packets, found.duplicates, found.reordered) == (6, 2, 3)
+
+
+def test_irtt_without_a_member_that_is_understood_says_why(tmp_path: Path) -> None:
+    with pytest.raises(MeasurementError, match=r"has no round trips: 1 line was not understood .*perhaps"):
+        read(tmp_path / "a", irtt([{"seqno": 0, "lost": "perhaps"}]))
 
 
 def test_irtt_with_members_that_are_broken_keeps_the_others(tmp_path: Path) -> None:
@@ -366,6 +402,21 @@ def test_numbers_of_a_table_begin_anew_and_may_be_missing(tmp_path: Path) -> Non
     flags = read(tmp_path / "c", "seq,lost\n1,0\n2,1\n5,0\n")
     assert flags.packets == 3
     assert "numbers are missing in 1 places" in said(flags)
+
+
+@pytest.mark.parametrize("columns", ["frame.time_epoch,icmp.seq", "icmp.seq,frame.time_epoch,icmp.type"])
+def test_a_table_of_both_directions_under_one_number_says_that_it_hides_losses(tmp_path: Path, columns: str) -> None:
+    names, rows = columns.split(","), []
+    for k in range(20):
+        for kind, late in [(8, 0.0)] if k in (5, 6) else [(8, 0.0), (0, 0.004)]:
+            cells = {"frame.time_epoch": f"{0.02 * k + late:.6f}", "icmp.seq": str(k), "icmp.type": str(kind)}
+            rows.append(",".join(cells[name] for name in names))
+    found = read(tmp_path / "a", "\n".join([columns, *rows]) + "\n")
+    assert "18 rows have the number of an earlier one" in said(found)
+    once = [row for row in rows if float(row.split(",")[names.index("frame.time_epoch")]) * 50 % 1 > 0.1]
+    found = read(tmp_path / "b", "\n".join([columns, *once, once[-1]]) + "\n")
+    assert (lost(found), found.duplicates) == ([5, 6], 1)
+    assert "rows have the number" not in said(found)
 
 
 @pytest.mark.parametrize("head", ["seq,sent,received", "seq,time,received", "seq,received"])
