@@ -46,6 +46,8 @@ def open_text(
         refuse_irregular(path)
         with open(path, encoding=encoding, newline=newline) as file:
             yield file
+    except UserError:  # what the reader of the file says of it
+        raise
     except OSError as error:
         raise kind(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:

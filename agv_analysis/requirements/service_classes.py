@@ -69,12 +69,13 @@ def load_classes(*files: Path) -> tuple[ServiceClass, ...]:
     found: dict[str, ServiceClass] = {}
     for file in (_OWN, *files):
         with open_text(str(file), UserError) as text:
-            try:
-                rows = yaml.safe_load(text)
-            except yaml.YAMLError as error:
-                raise UserError(f"{file}: is no YAML: {error}") from None
+            content = text.read()
+        try:
+            rows = yaml.safe_load(content)
+        except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that is none
+            raise UserError(f"{file}: is no YAML: {' '.join(str(error).split())}") from None
         if not isinstance(rows, list):
-            raise UserError(f"{file}: must be a list of classes")
+            raise UserError(f"{file}: must be a list of classes, got {'nothing' if rows is None else repr(rows)[:80]}")
         for number, row in enumerate(rows, start=1):
             one = _class(row, f"{file}: class {number}")
             found[one.name] = one

@@ -231,6 +231,25 @@ def test_a_row_without_a_source_is_refused(tmp_path: Path) -> None:
         find_class("gold", load_classes())
 
 
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "must be a list of classes, got nothing"),
+        ("name: x", "must be a list of classes, got {'name': 'x'}"),
+        ("{", "is no YAML: while parsing a flow node"),
+        ("- {version: 2026-13-01}", "is no YAML: month must be in 1..12"),
+        ("- 7", "class 1: must have names and values, got 7"),
+    ],
+)
+def test_a_file_that_has_no_classes_is_refused_in_a_line(tmp_path: Path, text: str, complaint: str) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as refused:
+        load_classes(path)
+    assert str(refused.value).startswith(f"{path}: {complaint}")
+    assert len(str(refused.value).splitlines()) == 1
+
+
 def a_class(**figures: float) -> ServiceClass:
     return ServiceClass("x", "service", "D", "T", "1", True, **figures)  # type: ignore[arg-type]
 

@@ -143,6 +143,7 @@ def test_what_cannot_be_played_is_refused(tmp_path: Path, text: str, complaint: 
     with pytest.raises(TraceError) as caught:
         losses(channel(path), 1, "uplink", 3, 0.1)
     assert complaint in str(caught.value)
+    assert str(caught.value).startswith(f"{path}:")  # not a complaint about the name
 
 
 def test_a_loop_is_late_by_the_delays_of_its_trace(tmp_path: Path) -> None:
