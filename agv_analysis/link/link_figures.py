@@ -21,6 +21,7 @@ from agv_analysis.link.resampling import weights
 from agv_analysis.metrics.confidence import CONFIDENCE
 from agv_analysis.metrics.outages import ages
 from agv_analysis.run import Floats
+from agv_plant.parameters import ChannelParameters
 from agv_ros.parameters import as_dict
 
 PERCENTILES = (50, 95, 99)
@@ -329,6 +330,9 @@ def rates_to_json(found: LossRates) -> dict[str, Any]:
         "outage_max_s": None,
         "delay": dict.fromkeys(("of", *_KEYS)),
         "jitter": dict.fromkeys(("of", *_KEYS)),
+        "duplicates": None,
+        "reordered": None,
+        "malformed": None,
         "fit": None,
         "stationarity": None,
         "intervals": [
@@ -343,7 +347,7 @@ def rates_to_json(found: LossRates) -> dict[str, Any]:
 
 
 def setting_to_json(found: Setting) -> dict[str, Any]:
-    """What an emulator was set to, as a channel; nothing was measured."""
+    """What an emulator was set to, as a channel, with the keys of a measurement; null for what only that would tell."""
     changed = ("model", "p", "r", "h", "k", "delay", "jitter", "duplicate")
     values, chain = as_dict(found.channel), chain_of(found.channel)
     rate = None if chain is None else {"value": chain.loss_rate, "low": chain.loss_rate, "high": chain.loss_rate}
@@ -351,12 +355,30 @@ def setting_to_json(found: Setting) -> dict[str, Any]:
         "source": found.source,
         "format": found.format,
         "packets": None,
+        "lost": None,
         "span_s": None,
         "interval_s": None,
-        UPLINK: {**_untold(), "loss_rate": rate},
+        UPLINK: {**_untold(), "loss_rate": rate, "delay": _delays_set(found.channel)},
         DOWNLINK: _untold(),
         ROUND_TRIP: _untold(),
+        "outage_max_s": None,
+        "delay": {"of": UPLINK, **_delays_set(found.channel)},
+        "jitter": dict.fromkeys(("of", *_KEYS)),
+        "duplicates": None,
+        "reordered": None,
+        "malformed": None,
+        "fit": None,
+        "stationarity": None,
+        "notes": [],
         "channel": {name: values[name] for name in changed},
         "exact": not found.differences,
         "differences": list(found.differences),
     }
+
+
+def _delays_set(channel: ChannelParameters) -> dict[str, float]:
+    """Percentiles of a delay that is uniform in delay +- jitter, but not below 0 [s]."""
+    delay, jitter = channel.delay, channel.jitter
+    late = [max(0.0, delay + jitter * (q / 50.0 - 1.0)) for q in PERCENTILES]
+    mean = delay if jitter <= delay else (delay + jitter) ** 2 / (4.0 * jitter)
+    return Spread(mean, tuple(late), delay + jitter, 0).to_json()

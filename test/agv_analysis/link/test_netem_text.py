@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from agv_analysis.link.formats import read_link
+from agv_analysis.link.link_figures import LinkFigures, setting_to_json
 from agv_analysis.link.markov_channel import chain_of
-from agv_analysis.link.measurement import MeasurementError, Setting
+from agv_analysis.link.measurement import LOST, RECEIVED, Measurement, MeasurementError, PacketOutcomes, Setting
 from agv_analysis.link.netem import NetemError
 from agv_analysis.link.netem_text import correlated_loss, four_states, read_netem
 from agv_plant.parameters import ChannelParameters
+from agv_plant.radio.delay import delay_in_slots
 
 
 def read(line: str) -> tuple[ChannelParameters, tuple[str, ...]]:
@@ -50,6 +52,21 @@ def test_options_that_say_nothing_of_a_message_may_stand_anywhere(tmp_path: Path
     setting = read_link(path)
     assert isinstance(setting, Setting)
     assert (setting.channel.delay, setting.channel.p, setting.differences) == (0.005, 0.01, ())
+
+
+@pytest.mark.parametrize("line", ["delay 20ms", "delay 20ms 5ms loss 1%", "delay 10ms 20ms"])
+def test_the_figures_of_a_setting_have_the_names_of_a_measurement(line: str) -> None:
+    found = setting_to_json(Setting("", "netem", line, *read(line)))
+    measured = Measurement("", "table", np.arange(3.0), PacketOutcomes(np.array([RECEIVED, LOST, RECEIVED], np.int8)))
+    assert set(LinkFigures(measured).to_json()) <= set(found)
+    assert (found["packets"], found["outage_max_s"], found["fit"], found["downlink"]["loss_rate"]) == (None,) * 4
+    u = np.linspace(0.0, 1.0, 100_001)
+    channel = read(line)[0]
+    late = np.array([delay_in_slots(value, channel.delay, channel.jitter, 1.0) for value in u])
+    expected = [late.mean(), *np.quantile(late, [0.5, 0.95, 0.99]), late.max()]
+    delay = [found["delay"][name] for name in ("mean_s", "p50_s", "p95_s", "p99_s", "max_s")]
+    assert delay == pytest.approx(expected, rel=1e-4)
+    assert found["uplink"]["delay"]["p95_s"] == found["delay"]["p95_s"]
 
 
 def test_what_ours_cannot_is_said() -> None:
