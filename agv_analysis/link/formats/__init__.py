@@ -23,6 +23,13 @@ def _found() -> dict[str, Format]:
 
 FORMATS = _found()
 
+_ABOUT = {
+    "columns": ("table", "--column names columns of one"), "delimiter": ("table", "--delimiter separates cells of one"),
+    "topic": ("bag or capture", "--topic is of one"),
+    "received": ("capture", "--received is a capture of the other end"),
+}  # fmt: skip
+"""What each of `Options` but the interval is about, and what it says there."""
+
 
 def format_of(path: Path, name: str = "") -> Format:
     """The format called `name`, or, without a name, that of what the file holds. Raises MeasurementError."""
@@ -49,6 +56,7 @@ def read_link(path: str | Path, options: Options | None = None, name: str = "") 
     """
     path, options = Path(path), options or Options()
     found = format_of(path, name or ("table" if options.columns or options.delimiter else ""))
-    if options.received is not None and found.name != "capture":
-        raise MeasurementError(f"{path}: is no capture ({found.title}), and --received is a capture of the other end")
+    for option, (other, what) in _ABOUT.items():
+        if getattr(options, option) and option not in found.takes:
+            raise MeasurementError(f"{path}: is no {other} ({found.title}), and {what}")
     return found.read(path, options)

@@ -151,4 +151,4 @@ def _places(times: Times, period: int) -> Times:
     return places
 
 
-FORMAT = Format("bag", "topic of a ROS 2 bag", 5, _matches, _read)
+FORMAT = Format("bag", "topic of a ROS 2 bag", 5, _matches, _read, ("topic",))

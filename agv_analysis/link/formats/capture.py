@@ -263,4 +263,4 @@ def _address(address: bytes, port: int) -> str:
     return f"{socket.inet_ntop(family, address)}:{port}"
 
 
-FORMAT = Format("capture", "capture of packets, pcap or pcapng", 6, _matches, _read)
+FORMAT = Format("capture", "capture of packets, pcap or pcapng", 6, _matches, _read, ("received", "topic"))

@@ -287,4 +287,6 @@ def _spread(sent: Floats, options: Options) -> list[str]:
     ]
 
 
-FORMAT = Format("table", "table with a header (CSV, tshark, our own traces)", 90, _matches, _read)
+FORMAT = Format(
+    "table", "table with a header (CSV, tshark, our own traces)", 90, _matches, _read, ("columns", "delimiter")
+)

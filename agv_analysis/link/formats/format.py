@@ -40,3 +40,5 @@ class Format(NamedTuple):
     matches: Callable[[bytes, Path], bool]
     """Does a file with this beginning, unpacked, look like it? Of a directory the beginning is empty."""
     read: Callable[[Path, Options], Reading]
+    takes: tuple[str, ...] = ()
+    """Which `Options` it takes beside the interval."""

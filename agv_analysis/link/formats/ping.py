@@ -21,7 +21,8 @@ import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.text_columns import Block, Places, blocks, is_preceded_by, numbers_at
-from agv_analysis.link.measurement import Malformed, Measurement, MeasurementError, PacketOutcomes
+from agv_analysis.link.large_arrays import count_of
+from agv_analysis.link.measurement import RECEIVED, Malformed, Measurement, MeasurementError, PacketOutcomes
 from agv_analysis.link.packet_grid import CountedOn, PacketGrid
 from agv_analysis.run import Floats
 
@@ -181,6 +182,10 @@ def _measurement(source: str, found: _Found, options: Options) -> Measurement:
     interval, said = _interval(found, options)
     is_dated = found.grid.dated > 1
     grid = found.grid.whole(interval, first, last)
+    replies = count_of(grid.outcome, lambda part: part == RECEIVED)
+    if found.received is not None and found.received != replies:
+        said_of_both = f"{replies} replies are in the log, and {found.received} by its summary"
+        notes = (*notes, f"{said_of_both}: a number without a reply counts as lost")
     if not is_dated:
         notes = (*notes, said)
     if found.below:

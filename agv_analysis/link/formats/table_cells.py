@@ -13,7 +13,7 @@ Flags = NDArray[np.bool_]
 
 _TRUE = (b"1", b"true", b"yes", b"y", b"t")
 _FALSE = (b"0", b"false", b"no", b"n", b"f")
-_IS_LOST = {b"lost": True, b"dropped": True, b"delivered": False, b"received": False, b"ok": False}
+_IS_LOST = {b"lost": True, b"dropped": True, b"timeout": True, b"delivered": False, b"received": False, b"ok": False}
 
 _DAY = 86400.0
 _DATE = np.frombuffer(b"dddd-dd-ddTdd:dd:", dtype=np.uint8)

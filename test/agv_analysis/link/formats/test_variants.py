@@ -36,6 +36,24 @@ def said(found: Measurement) -> str:
     return " ".join((*found.notes, *found.malformed.sentences()))
 
 
+@pytest.mark.parametrize(
+    ("options", "name", "flag"),
+    [
+        (Options(topic="/edge/pose"), "", "--topic"),
+        (Options(columns={"time": "t"}), "ping", "--column"),
+        (Options(delimiter=";"), "ping", "--delimiter"),
+        (Options(received=Path("there.pcap")), "", "--received"),
+    ],
+)
+def test_an_option_about_another_kind_of_file_is_refused(
+    tmp_path: Path, options: Options, name: str, flag: str
+) -> None:
+    path = tmp_path / "log"
+    path.write_text("64 bytes from 10.0.0.2: icmp_seq=1 ttl=64 time=1 ms\n")
+    with pytest.raises(MeasurementError, match=rf"log: is no .* \(output of ping\), and {flag} "):
+        read_link(path, options, name)
+
+
 # -- ping --------------------------------------------------------------------------------------------------------------
 
 
@@ -90,6 +108,10 @@ def test_the_summary_of_ping_counts_what_was_lost_last_in_any_language(tmp_path:
     found = read(tmp_path / "a", text + "\nrtt min/avg/max/mdev = 0,5/0,5/0,5/0,0 ms\n")
     assert (found.packets, lost(found), found.malformed.count) == (5, [3, 4], 0)
     assert found.interval == pytest.approx(0.02)
+    assert "by its summary" not in said(found)
+    found = read(tmp_path / "b", text.replace(f"{lines[1]}\n", ""))
+    assert lost(found) == [1, 3, 4]
+    assert "2 replies are in the log, and 3 by its summary" in said(found)
 
 
 @pytest.mark.parametrize(
@@ -356,6 +378,12 @@ def test_tables_with_any_separator(tmp_path: Path, text: str, options: Options) 
     assert (lost(found), found.malformed.count) == ([1], 0)
     assert found.sent.tolist() == pytest.approx([0.0, 0.02, 0.04])
     assert delays(found) == pytest.approx([0.005, NAN, 0.007], nan_ok=True)
+
+
+@pytest.mark.parametrize("word", ["lost", "DROPPED", "timeout", "1", "yes", "True"])
+def test_words_for_a_loss(tmp_path: Path, word: str) -> None:
+    found = read(tmp_path / "a", f"time,lost\n0,0\n0.1,{word}\n0.2,ok\n")
+    assert (lost(found), found.malformed.count) == ([1], 0)
 
 
 def test_a_delimiter_is_one_character(tmp_path: Path) -> None:
