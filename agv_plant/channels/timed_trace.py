@@ -261,7 +261,7 @@ def _checked(rows: Floats, path: str) -> Trace:
         raise TraceError(f"{path}: row {bad[0] + 1}: time must increase from row to row, found {time[bad[0]]:g} s")
     lost = flags != 0.0
     if rows.shape[1] < 3:
-        return Trace(lost, time - time[0])
+        return Trace(lost, _since_first(time))
     delay = np.where(lost, 0.0, rows[:, 2])
     bad = np.flatnonzero(~(np.nan_to_num(delay, nan=0.0) >= 0.0) | np.isinf(delay))
     if len(bad):
@@ -270,4 +270,18 @@ def _checked(rows: Floats, path: str) -> Trace:
     known = ~np.isnan(delay) & ~lost
     last = np.maximum.accumulate(np.where(known, np.arange(len(delay)), -1))
     filled = np.where(lost, 0.0, np.where(last >= 0, delay[np.maximum(last, 0)], 0.0))
-    return Trace(lost, time - time[0], np.nan_to_num(filled) if filled.any() else None)
+    return Trace(lost, _since_first(time), np.nan_to_num(filled) if filled.any() else None)
+
+
+_DATE = 1e8
+"""Times of more seconds than this count from 1970."""
+
+
+def _since_first(time: Floats) -> Floats:
+    """Times [s] since the first, shape (n,).
+
+    Those since 1970 to the microsecond: as floats they are off by 0.1 us, and a packet that is late by that is not yet
+    there when the slot begins to which it belongs.
+    """
+    since = time - time[0]
+    return np.asarray(np.round(since, 6) if time[0] > _DATE else since)

@@ -146,6 +146,20 @@ def test_what_cannot_be_played_is_refused(tmp_path: Path, text: str, complaint: 
     assert str(caught.value).startswith(f"{path}:")  # not a complaint about the name
 
 
+@pytest.mark.parametrize("kind", ["csv", "json"])
+def test_a_trace_of_today_decides_slot_by_slot_where_its_period_is_the_loops(tmp_path: Path, kind: str) -> None:
+    """Times since 1970 are floats that are off by 0.1 us."""
+    lost = [k > 0 and (k * k) % 7 < 2 for k in range(500)]
+    at = [123_456 + 20_000 * k for k in range(500)]  # us
+    time = [f"{1_700_000_000 + us // 10**6}.{us % 10**6:06d}" for us in at]
+    path = tmp_path / f"t.{kind}"
+    if kind == "csv":
+        path.write_text("time,lost\n" + "".join(f"{t},{int(gone)}\n" for t, gone in zip(time, lost, strict=True)))
+    else:
+        path.write_text(f'{{"time": [{", ".join(time)}], "lost": {json.dumps([int(gone) for gone in lost])}}}')
+    assert losses(channel(path), 1, "uplink", 500, 0.02).tolist() == lost
+
+
 def test_a_loop_is_late_by_the_delays_of_its_trace(tmp_path: Path) -> None:
     path = tmp_path / "late.csv"
     path.write_text("time,lost,delay\n0.0,0,0.012\n1.0,0,0.012\n")
