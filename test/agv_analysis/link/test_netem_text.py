@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -161,6 +162,40 @@ def test_a_file_with_a_line_is_a_setting(tmp_path: Path) -> None:
     path.write_text("tc qdisc add dev eth0 root netem loss 1%\ntc qdisc add dev eth1 root netem loss 2%\n")
     with pytest.raises(MeasurementError, match="has 2 lines for netem, which are one link each"):
         read_link(path)
+
+
+def shown(options: dict[str, object], kind: str = "netem", dev: str = "eth0") -> dict[str, object]:
+    return {"kind": kind, "handle": "1:", "dev": dev, "root": True, "refcnt": 2, "options": options}
+
+
+def test_what_tc_shows_as_json_is_what_it_shows_as_text(tmp_path: Path) -> None:
+    path, limit = tmp_path / "tc.json", {"limit": 1000, "ecn": False, "gap": 0}
+    delay = {"delay": {"delay": 0.02, "jitter": 0.005, "correlation": 0}}
+    pairs: list[tuple[dict[str, object], str]] = [
+        ({**delay, "loss-random": {"loss": 0.05, "correlation": 0}}, "delay 20ms 5ms loss 5%"),
+        ({"delay": {"delay": 1.5e-05, "jitter": 0, "correlation": 0.25}}, "delay 15us 0s 25%"),
+        ({"loss-random": {"loss": 0.3, "correlation": 0.25}}, "loss 30% 25%"),
+        ({"loss-gemodel": {"p": 0.01, "r": 0.1, "1-h": 0.7, "1-k": 0.001}}, "loss gemodel 1% 10% 70% 0.1%"),
+        ({"loss-state": {"p13": 0.01, "p31": 0.1, "p32": 0, "p23": 1, "p14": 0.02}}, "loss state 1% 10% 0% 100% 2%"),
+        ({"duplicate": {"duplicate": 0.01, "correlation": 0.5}}, "duplicate 1% 50%"),
+        ({**delay, "reorder": {"reorder": 0.25, "correlation": 0.5}, "gap": 5}, "delay 20ms 5ms reorder 25% 50% gap 5"),
+        ({"corrupt": {"corrupt": 1e-3, "correlation": 0}, "rate": {"rate": 125000, "cellsize": 0}},
+         "corrupt 0.1% rate 1000000bit"),
+    ]  # fmt: skip
+    for options, line in pairs:
+        path.write_text(json.dumps([shown({}, "noqueue", "lo"), shown({**limit, **options})], indent=4))
+        found = read_link(path)
+        assert isinstance(found, Setting)
+        channel, differences = read(line)
+        assert (found.channel, found.differences) == (channel, differences), line
+    path.write_text(json.dumps([shown({**limit, **delay}), shown({"rate": 125000}, "tbf")]))
+    found = read_link(path)
+    assert isinstance(found, Setting)
+    assert found.differences == ("the qdisc tbf of eth0 acts on the link as well, and is left out here",)
+    for other in ("[1, 2]", '[{"kind": "netem", "options": {"delay": 7, "loss-random": {"loss": "x"}}}]', "[", "[]"):
+        path.write_text(other)
+        with pytest.raises(MeasurementError, match="is in no format that is known here"):
+            read_link(path)
 
 
 def test_what_tc_shows_of_several_devices(tmp_path: Path) -> None:
