@@ -50,7 +50,9 @@ from agv_analysis.run import Floats
 _BEGIN = re.compile(rb'"round_trips"\s*:\s*\[')
 _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\\?\Z)', re.DOTALL)
 """A string of JSON, which may be cut."""
-_STATED = tuple(re.compile(rb'"%b"\s*:\s*(\d+)' % name) for name in (b"interval", b"duplicates", b"late_packets"))
+_STATED = tuple(
+    re.compile(rb'"%b"\s*:\s*(\d{1,18})(?![\d.eE])' % name) for name in (b"interval", b"duplicates", b"late_packets")
+)
 """What irtt says before the round trips, which have none of them: replies that came twice, or behind a later one."""
 _NS = 1e-9
 _BATCH, _LARGE_BATCH = 1 << 16, 1 << 18
@@ -58,6 +60,9 @@ _BATCH, _LARGE_BATCH = 1 << 16, 1 << 18
 
 _MANY = 1 << 21
 """Bytes of a file from which on members that are written alike are looked for: that takes a while to begin."""
+
+_LARGEST = 2**63
+"""Numbers from here on are none of irtt's, which have 64 bits and a sign."""
 
 _WAYS = {
     "false": (RECEIVED, RECEIVED, RECEIVED),
@@ -84,14 +89,25 @@ class _Table:
     def __init__(self) -> None:
         self.seq, self.word = Column(np.int64), Column(np.int8)
         self.delays, self.stamps = [Column() for _ in range(3)], [Column() for _ in range(2)]
+        self._begin: int | None = None
+        """The first stamp of the clock that counts from 1970 [ns], from which on the others count."""
 
     def extend(self, trips: list[Trip]) -> None:
         if trips:
             seq, word, *times = zip(*trips, strict=True)
-            self.extend_columns(np.array(seq, dtype=np.int64), np.array(word, dtype=np.int8), np.array(times).T)
+            wall = np.array([0 if math.isnan(at) else int(at) for at in times[-1]], dtype=np.int64)
+            columns = np.array(times, dtype=np.float64).T
+            self.extend_columns(np.array(seq, dtype=np.int64), np.array(word, dtype=np.int8), columns, wall)
 
-    def extend_columns(self, seq: NDArray[np.int64], word: NDArray[np.int8], times: Floats) -> None:
-        """`times` [ns], shape (n, 5)."""
+    def extend_columns(
+        self, seq: NDArray[np.int64], word: NDArray[np.int8], times: Floats, wall: NDArray[np.int64]
+    ) -> None:
+        """`times` [ns], shape (n, 5), the last of them as integers, shape (n,)."""
+        times[~(np.abs(times) < _LARGEST)] = np.nan
+        known = ~np.isnan(times[:, -1])
+        if self._begin is None and known.any():
+            self._begin = int(wall[known][0])
+        times[known, -1] = wall[known] - (self._begin or 0)
         self.seq.extend(seq)
         self.word.extend(word)
         for i, column in enumerate((*self.delays, *self.stamps)):
@@ -135,7 +151,7 @@ def _without_alike(batch: bytes, shapes: Shapes, table: _Table) -> tuple[bytes, 
     at, count = 0, 0
     while True:
         alike = shapes.read(batch, at)
-        table.extend_columns(alike.seq, alike.word, alike.times)
+        table.extend_columns(alike.seq, alike.word, alike.times, alike.wall)
         at, count = alike.end, count + len(alike.seq)
         if at >= len(batch) or not shapes.learn(batch, at):
             return batch[at:], count
@@ -214,7 +230,7 @@ _NEXT = re.compile(r'\}\s*,\s*(\{\s*"seqno")')
 def _trip(member: Any) -> Trip | None:
     """What a member says; None if it is no round trip."""
     seqno = member.get("seqno") if isinstance(member, dict) else None
-    if not isinstance(seqno, int) or isinstance(seqno, bool):
+    if not isinstance(seqno, int) or not _is_number(seqno):
         return None
     word = member.get("lost", "")
     word = word.lower() if isinstance(word, str) else word
@@ -225,7 +241,7 @@ def _trip(member: Any) -> Trip | None:
     rtt = _number(delay.get("rtt"))
     return (
         seqno, _word(_WORDS[word], rtt), _number(delay.get("send")), _number(delay.get("receive")), rtt,
-        _number(sent.get("monotonic")), _number(sent.get("wall")),
+        _number(sent.get("monotonic")), _whole(sent.get("wall")),
     )  # fmt: skip
 
 
@@ -235,8 +251,18 @@ def _part(member: Any, *names: str) -> dict[str, Any]:
     return member if isinstance(member, dict) else {}
 
 
+def _is_number(value: Any) -> bool:
+    """One that an integer of 64 bits may be near to: durations of irtt are no others."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and -_LARGEST < value < _LARGEST
+
+
 def _number(value: Any) -> float:
-    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    return float(value) if _is_number(value) else math.nan
+
+
+def _whole(value: Any) -> float:
+    """As `_number`, an integer if it is one."""
+    return value if _is_number(value) else math.nan
 
 
 def _word(code: int, rtt: float) -> int:
@@ -253,9 +279,8 @@ def _decoder() -> Callable[[bytes], list[Trip] | None]:
         return _decode_as_json
 
     nothing: Any = math.nan
-    numbers = {name: msgspec.defstruct(name, [(key, float, nothing) for key in keys], gc=False) for name, keys in (
-        ("Stamps", ("monotonic", "wall")), ("Delay", ("send", "receive", "rtt")))}  # fmt: skip
-    stamps, delay = numbers["Stamps"], numbers["Delay"]
+    stamps = msgspec.defstruct("Stamps", [("monotonic", float, nothing), ("wall", int | float, nothing)], gc=False)
+    delay = msgspec.defstruct("Delay", [(key, float, nothing) for key in ("send", "receive", "rtt")], gc=False)
     client = msgspec.defstruct("Client", [("send", stamps, msgspec.field(default_factory=stamps))])
     both = msgspec.defstruct("Both", [("client", client, msgspec.field(default_factory=client))])
     trip: Any = msgspec.defstruct("Trip", [
@@ -267,9 +292,11 @@ def _decoder() -> Callable[[bytes], list[Trip] | None]:
     def decode(batch: bytes) -> list[Trip] | None:
         try:
             found = decoder.decode(b"[" + batch.strip(b" \t\r\n,") + b"]")
+            if not all(_is_number(one.seqno) for one in found):
+                return None
             return [
                 (one.seqno, _word(_WORDS[one.lost], one.delay.rtt), one.delay.send, one.delay.receive, one.delay.rtt,
-                 one.timestamps.client.send.monotonic, one.timestamps.client.send.wall)
+                 one.timestamps.client.send.monotonic, _whole(one.timestamps.client.send.wall))
                 for one in found
             ]  # fmt: skip
         except (msgspec.DecodeError, KeyError):

@@ -21,7 +21,10 @@ from agv_analysis.link.formats.text_columns import Bytes
 from agv_analysis.run import Floats
 
 Trip = tuple[int, int, float, float, float, float, float]
-"""Number, code of irtt's word, delays up, down and whole [ns], when it was sent [ns] by two clocks; NaN: not there."""
+"""Number, code of irtt's word, delays up, down and whole [ns], when it was sent [ns] by two clocks; NaN: not there.
+
+The last clock counts from 1970 and is an integer where the file has one, since floats are only exact to 0.2 us there.
+"""
 
 _WORD = 1
 """Place of the word in a trip; the others are numbers of the member, or not there."""
@@ -54,6 +57,8 @@ class Alike(NamedTuple):
     word: NDArray[np.int8]
     times: Floats
     """The other numbers of a trip [ns], shape (n, 5)."""
+    wall: NDArray[np.int64]
+    """The last of them as integers, where they are there, shape (n,)."""
     end: int
     """Where the first byte is that belongs to none of them."""
 
@@ -85,7 +90,7 @@ class Shapes:
         times = numbers[:count, 1:].astype(np.float64)
         if not arrays.has.all():
             times[~arrays.has[shape]] = np.nan
-        return Alike(numbers[:count, 0], arrays.words[shape], times, at)
+        return Alike(numbers[:count, 0], arrays.words[shape], times, numbers[:count, -1], at)
 
     def learn(self, batch: bytes, at: int) -> bool:
         """Learn the shape of the member that begins at a place of a text; False if it has none, or is known."""
@@ -170,7 +175,8 @@ def _arrays(known: list[_Shape]) -> _Arrays:
 
 
 def _nothing(at: int) -> Alike:
-    return Alike(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int8), np.zeros((0, _FIELDS - 1)), at)
+    none = np.zeros(0, dtype=np.int64)
+    return Alike(none, none.astype(np.int8), np.zeros((0, _FIELDS - 1)), none, at)
 
 
 def _member(batch: bytes, at: int) -> bytes | None:

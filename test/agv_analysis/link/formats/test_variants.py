@@ -319,6 +319,66 @@ def test_irtt_that_is_written_alike_reads_as_the_json_module_reads_it(
         np.testing.assert_array_equal(one.delay, other.delay)
 
 
+@pytest.mark.parametrize("reader", ["msgspec", "json", "alike"])
+def test_irtt_that_stamps_by_the_wall_clock_alone_is_as_exact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str
+) -> None:
+    from agv_analysis.link.formats import irtt_json
+
+    if reader == "msgspec":
+        pytest.importorskip("msgspec")
+    else:
+        monkeypatch.setattr(irtt_json, "_decoder", lambda: irtt_json._decode_as_json)
+        monkeypatch.setattr(irtt_json, "_MANY", 0 if reader == "alike" else 1 << 21)
+    begin, step = 1_700_000_000_999_123_457, 2_000_001  # ns
+    trips: list[object] = [
+        {"seqno": i, "lost": "true_up" if i == 7 else "false", "delay": {} if i == 7 else {"rtt": 5_000_000},
+         "timestamps": {"client": {"send": {} if i == 9 else {"wall": begin + i * step}}}}
+        for i in range(50)
+    ]  # fmt: skip
+    found = read(tmp_path / "a", irtt(trips))
+    assert lost(found) == [7]
+    assert found.sent == pytest.approx([1e-9 * step * i for i in range(50)], abs=1e-12)
+
+
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "1e400", "-1e30", "123456789012345678901234567890"])
+@pytest.mark.parametrize("key", ["rtt", "wall", "monotonic", "seqno"])
+def test_irtt_with_numbers_that_are_none_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: str, key: str
+) -> None:
+    from agv_analysis.link.formats import irtt_json
+
+    def trip(i: int) -> str:
+        values = {"seqno": i, "rtt": 5_000_000 + i, "wall": 17 * 10**17 + i, "monotonic": 10**9 + i}
+        seqno, rtt, wall, monotonic = (number if (name, i) == (key, 2) else value for name, value in values.items())
+        return (
+            f'{{"seqno": {seqno}, "lost": "false", "delay": {{"rtt": {rtt}}}, '
+            f'"timestamps": {{"client": {{"send": {{"wall": {wall}, "monotonic": {monotonic}}}}}}}}}'
+        )
+
+    text = irtt([trip(i) for i in range(5)])
+    for decoder in (irtt_json._decoder(), irtt_json._decode_as_json):
+        monkeypatch.setattr(irtt_json, "_decoder", lambda found=decoder: found)
+        found = read(tmp_path / "a", text)
+        assert (found.packets, lost(found), found.malformed.count) == ((4, [], 1) if key == "seqno" else (5, [], 0))
+        assert len([late for late in delays(found) if late == late]) == (4 if key in ("rtt", "seqno") else 5)
+        assert found.span == pytest.approx(4e-9)
+
+
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "1e400", "NaN", "1e30"])
+def test_totals_that_none_can_be_are_none(tmp_path: Path, number: str) -> None:
+    """Of iperf3 those rows are left out; of irtt, whose totals are integers, they are not there."""
+    total = {"start": 0, "end": 1.0, "packets": 100, "lost_packets": 3}
+    for key, value in total.items():
+        text = json.dumps({"start": {"test_start": {"protocol": "UDP"}}, "end": {"sum": total}})
+        (tmp_path / "a").write_text(text.replace(f'"{key}": {json.dumps(value)}', f'"{key}": {number}'))
+        with pytest.raises(MeasurementError, match="has neither intervals nor sums"):
+            read_link(tmp_path / "a")
+    trips: list[object] = [{"seqno": i, "lost": "false", "delay": {"rtt": 5_000_000}} for i in range(3)]
+    found = read(tmp_path / "b", irtt(trips, params=f'"interval": {number}, "duplicates": {number}'))
+    assert (found.interval, found.duplicates) == (1.0, 0)
+
+
 def test_irtt_whose_members_are_longer_than_what_is_read_at_a_time(tmp_path: Path) -> None:
     trips: list[object] = [{"seqno": i, "lost": "false", "note": "x" * 100_000, "delay": {"rtt": i}} for i in range(5)]
     found = read(tmp_path / "a", irtt(trips))
