@@ -80,6 +80,8 @@ class _Line:
             number = _TIME.fullmatch(self.take())
             assert number is not None
             found.append(float(Decimal(number[1]) * _SECONDS[number[2].lower()]))
+            if not math.isfinite(found[-1]):
+                raise NetemError(f"netem: no delay is as long as {number[0][:40]!r}")
         return found
 
     def _is_time(self) -> bool:

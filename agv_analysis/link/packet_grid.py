@@ -22,6 +22,10 @@ _SPARSE, _MOST_MISSING = 1000, 1_000_000
 """A series of numbered packets may lack so many for each that is there, and so many more."""
 
 
+class NumbersError(MeasurementError):
+    """Numbers that can be none of a sequence; the text does not name the file."""
+
+
 class Grid(NamedTuple):
     """Every packet of a numbered measurement, received or not; shapes (N,)."""
 
@@ -151,7 +155,7 @@ class PacketGrid:
 
 def _check(first: int, last: int, records: int) -> None:
     if last - first + 1 > _SPARSE * records + _MOST_MISSING:
-        raise MeasurementError(
+        raise NumbersError(
             f"numbers go from {first} to {last}, and {records} packets have one: these are no sequence numbers, or one "
             "of them is broken"
         )

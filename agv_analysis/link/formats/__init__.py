@@ -12,6 +12,7 @@ from pathlib import Path
 from agv_analysis.link.formats.format import Format, Options
 from agv_analysis.link.formats.text_columns import head_of
 from agv_analysis.link.measurement import MeasurementError, Reading
+from agv_analysis.link.packet_grid import NumbersError
 
 
 def _found() -> dict[str, Format]:
@@ -59,4 +60,7 @@ def read_link(path: str | Path, options: Options | None = None, name: str = "") 
     for option, (other, what) in _ABOUT.items():
         if getattr(options, option) and option not in found.takes:
             raise MeasurementError(f"{path}: is no {other} ({found.title}), and {what}")
-    return found.read(path, options)
+    try:
+        return found.read(path, options)
+    except NumbersError as error:
+        raise MeasurementError(f"{path}: {error}") from None

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.link.formats.format import Format, Options
+from agv_analysis.link.formats.rows import MOST_EXACT
 from agv_analysis.link.formats.table_header import FLAGS, columns_of, header_of, is_enough
 from agv_analysis.link.formats.table_rows import TableRows
 from agv_analysis.link.formats.text_columns import blocks
@@ -215,7 +216,7 @@ def _by_number(path: Path, rows: TableRows, options: Options) -> Measurement:
     found, numbers = PacketGrid(len(delays)), CountedOn(may_be_before=False)
     for block in blocks(path, options.progress):
         part = rows.part(block)
-        is_numbered = np.isfinite(part["seq"])
+        is_numbered = np.abs(part["seq"]) < MOST_EXACT
         rows.malformed.count += int(np.count_nonzero(~is_numbered))
         seq = numbers.take(part["seq"][is_numbered].astype(np.int64))
         given = [part[role][is_numbered] for role in delays]
@@ -233,7 +234,7 @@ def _by_arrival(source: str, values: dict[str, NDArray[Any]], rows: TableRows, o
     seq, arrived, sent = values["seq"], values["received"], values.get("sent", values.get("time"))
     found, numbers = PacketGrid(0 if sent is None else 1), CountedOn(may_be_before=False)
     for part in parts(len(seq), seq, arrived, sent):
-        is_numbered = np.isfinite(seq[part])
+        is_numbered = np.abs(seq[part]) < MOST_EXACT
         rows.malformed.count += int(np.count_nonzero(~is_numbered))
         places, came = numbers.take(seq[part][is_numbered].astype(np.int64)), arrived[part][is_numbered]
         if sent is None:

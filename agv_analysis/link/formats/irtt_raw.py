@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
-from agv_analysis.link.formats.rows import parts_of_rows
+from agv_analysis.link.formats.rows import MOST_EXACT, parts_of_rows
 from agv_analysis.link.large_arrays import is_all_nan
 from agv_analysis.link.measurement import (
     Malformed,
@@ -42,7 +42,7 @@ def _matches(head: bytes, path: Path) -> bool:
 def _read(path: Path, options: Options) -> Measurement:
     malformed, found, duplicates = Malformed(), PacketGrid(delays=3), 0
     for table in parts_of_rows(path, _COLUMNS, malformed, options.progress, _WANTED):
-        is_numbered, again = ~np.isnan(table[:, 0]), table[:, 4] == 1.0
+        is_numbered, again = np.abs(table[:, 0]) < MOST_EXACT, table[:, 4] == 1.0
         malformed.count += int(np.count_nonzero(~is_numbered))
         duplicates += int(np.count_nonzero(is_numbered & again))
         table = table[is_numbered & ~again]

@@ -31,7 +31,7 @@ _LINE = re.compile(rb"^seq=\d+ rtt=-?[\d.]+", re.MULTILINE)
 _OTHER = re.compile(rb"\[.*\] .*|DUP! seq=\d+|\s.*|.*(stats|rate|loss|duration|pkts|sent/received|Min|---|RTT).*")
 """Lines that say nothing of a reply: events, duplicates, and the table at the end, which is set to the right."""
 
-_SENT = re.compile(rb"\s*packets sent/received: (\d+)/\d+")
+_SENT = re.compile(rb"\s*packets sent/received: (\d{1,18})/\d+")
 
 _USUAL_INTERVAL = 1.0
 """Time between packets that irtt takes without -i [s]."""

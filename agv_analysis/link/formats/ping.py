@@ -31,8 +31,8 @@ _USUAL_INTERVAL = 1.0
 
 _HEADER = re.compile(rb"PING6?[\s(]")
 _SUMMARY = re.compile(
-    rb"[^\d%]*(\d+)[^\d,%]*(?:,|\xef\xbc\x8c|\xe3\x80\x81)[^\d%]*(\d+)[^\d%].*[^\w:.][\d.]+ ?%"
-    rb"[^,]*(?:, ?[^\d,]*(\d+) ?(?:ms|[\x80-\xff]))?"
+    rb"[^\d%]*(\d{1,18})[^\d,%]*(?:,|\xef\xbc\x8c|\xe3\x80\x81)[^\d%]*(\d{1,18})[^\d%].*[^\w:.][\d.]+ ?%"
+    rb"[^,]*(?:, ?[^\d,]*(\d{1,18}) ?(?:ms|[\x80-\xff]))?"
 )
 """The same in every language: packets sent, received, a percentage, and perhaps the time; commas may be Chinese."""
 _REPLY = re.compile(rb"[:,] (?:icmp_)?seq=\d+ (?:ttl|hlim)=\d+|no answer yet for icmp_seq=\d+")
@@ -78,7 +78,7 @@ def _read(path: Path, options: Options) -> Measurement:
         _read_block(block, found, path)
     if found.begin is None and found.received == 0 and found.transmitted:  # whose lines are not needed
         found.begin = 1
-        found.grid.mention(np.arange(1, found.transmitted + 1))
+        found.grid.mention(np.ones(1, dtype=np.int64))
     if found.begin is None:
         only = ": it has the summary alone; run ping without -q and -f" if found.transmitted is not None else ""
         raise MeasurementError(f"{path}: has no line of a packet{only}")

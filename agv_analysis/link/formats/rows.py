@@ -47,6 +47,9 @@ def words_of(block: Block, count: int) -> Words:
 _MOST_DIGITS = 19
 """Digits that an unsigned integer of 64 bits holds, whatever they are."""
 
+MOST_EXACT = 2.0**53
+"""Whole numbers below this are exact as floats: others are no sequence numbers."""
+
 _NOTHING = (b"", b"nan", b"na", b"n/a", b"null", b"none", b"-", b".", b"*", b"lost", b"timeout")
 """What stands for a number that is not there."""
 
@@ -128,7 +131,7 @@ def parts_of_rows(
         good = np.ones(len(table), dtype=np.bool_)
         for place, column in enumerate(columns):
             table[:, place], fine = floats_at(block.text, words.begins[:, column], words.ends[:, column])
-            good &= fine
+            good &= fine & ~np.isinf(table[:, place])
         for i in np.flatnonzero(~good).tolist():
             malformed.add(block.number + int(words.lines[i]), block.line(int(words.lines[i])))
         yield table[good]

@@ -11,9 +11,26 @@ import pytest
 
 from agv_analysis.link.formats import format_of, read_link
 from agv_analysis.link.formats.format import Options
-from agv_analysis.link.measurement import LOST, NOT_SENT, RECEIVED, UNKNOWN, Measurement, MeasurementError
+from agv_analysis.link.link_figures import LinkFigures, setting_to_json
+from agv_analysis.link.measurement import (
+    LOST,
+    NOT_SENT,
+    RECEIVED,
+    UNKNOWN,
+    LossRates,
+    Measurement,
+    MeasurementError,
+    Reading,
+    Setting,
+)
+from agv_ros.errors import UserError
 
 NAN = float("nan")
+
+
+def to_json(found: Reading) -> dict[str, object]:
+    assert not isinstance(found, LossRates)
+    return setting_to_json(found) if isinstance(found, Setting) else LinkFigures(found).to_json()
 
 
 def read(path: Path, text: str, options: Options | None = None) -> Measurement:
@@ -377,6 +394,34 @@ def test_totals_that_none_can_be_are_none(tmp_path: Path, number: str) -> None:
     trips: list[object] = [{"seqno": i, "lost": "false", "delay": {"rtt": 5_000_000}} for i in range(3)]
     found = read(tmp_path / "b", irtt(trips, params=f'"interval": {number}, "duplicates": {number}'))
     assert (found.interval, found.duplicates) == (1.0, 0)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "1e400", "inf", "99999999999999999999", "1e15"])
+def test_numbers_that_nothing_can_be_are_named_or_left_out(tmp_path: Path, number: str) -> None:
+    """Whatever is read of such a file is finite, as JSON must be, or it is refused by name."""
+    header = "PING 1.1.1.1 (1.1.1.1) 56(84) bytes of data.\n"
+    line = "64 bytes from 1.1.1.1: icmp_seq={} ttl=64 time={} ms"
+    end = f"\n--- x ping statistics ---\n{number} packets transmitted, {{}} received, 0% packet loss, time {number}ms\n"
+    texts = [
+        header + line.format(1, 1) + end.format(1),
+        header + end.format(0),
+        header + "\n".join([line.format(1, 1), line.format(2, number), line.format(number, 1)]),
+        f"seq,sent,received\n0,0,0.1\n{number},1,1.1\n2,2,{number}\n3,3,3.1\n",
+        f"time,seq,rtt_ms\n0,0,5\n1,{number},5\n{number},2,5\n3,3,{number}\n4,4,5\n",
+        f"0 5.0 2.0 3.0 NaN 0 0\n1 {number} 2.0 3.0 NaN 0 0\n{number} 5.0 2.0 3.0 NaN 0 0\n3 5 2 {number} NaN 0 0\n",
+        f"seq=0 rtt=1ms\nseq=2 rtt={number}ms\n   packets sent/received: {number}/2 (3% loss)\n",
+        f"1\n2\n{number}\n",
+        f"delay {number}ms\n",
+    ]
+    for text in texts:
+        path = tmp_path / "log"
+        path.write_text(text)
+        try:
+            answer = json.dumps(to_json(read_link(path)), allow_nan=False)
+        except UserError as refused:
+            answer = str(refused)
+        assert "\n" not in answer
 
 
 def test_irtt_whose_members_are_longer_than_what_is_read_at_a_time(tmp_path: Path) -> None:
