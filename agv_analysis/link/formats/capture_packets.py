@@ -60,7 +60,7 @@ def packets_of(path: Path, malformed: Malformed, progress: Progress | None) -> I
     with open_binary(path) as file:
         try:
             reader = dpkt.pcap.UniversalReader(watched := _Watched(file))
-        except (ValueError, dpkt.Error) as error:
+        except (ValueError, dpkt.Error, struct.error) as error:
             raise MeasurementError(f"{path}: is no capture: {error}") from None
         if hasattr(reader, "_divisor"):  # else its stamps are floats, which are exact to 0.2 us
             reader._divisor = Decimal(reader._divisor)

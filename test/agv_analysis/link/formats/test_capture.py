@@ -145,6 +145,13 @@ def test_stamps_of_a_capture_are_as_exact_as_it_has_them(tmp_path: Path, kind: s
     assert measured(received).sent == pytest.approx([0.002 * i for i in range(N)], abs=1e-12)
 
 
+def test_a_capture_whose_unit_of_time_has_no_byte_is_refused(tmp_path: Path) -> None:
+    path = capture_of(tmp_path / "capture", [(10**18, frame(rtps(1)))], "pcapng")
+    path.write_bytes(path.read_bytes().replace(struct.pack("<HHB3x", 9, 1, 9), struct.pack("<HHHH", 9, 0, 0, 0)))
+    with pytest.raises(MeasurementError, match="capture: is no capture: "):
+        read_link(path)
+
+
 def test_a_capture_that_says_nothing_of_losses_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path / "x.pcap", [(1.0, frame(b"no numbers"))])
     with pytest.raises(MeasurementError, match="has no samples of RTPS"):
