@@ -58,6 +58,7 @@ def read_link_file(file: Path, file_options: FileOptions) -> Reading:
     from agv_analysis.link.formats import read_link
     from agv_analysis.link.formats.format import Options
     from agv_analysis.link.formats.netem_line import setting
+    from agv_analysis.link.measurement import MeasurementError
     from agv_analysis.link.netem_text import is_netem
 
     columns = dict(map(_column, file_options["columns"]))
@@ -66,6 +67,8 @@ def read_link_file(file: Path, file_options: FileOptions) -> Reading:
     )
     name = file_options["format_name"]
     if is_netem(str(file)) and not os.path.exists(file):  # noqa: PTH110  # Path.exists minds what is too long for a name
+        if given := _given(file_options):
+            raise MeasurementError(f"{given}, but {str(file)!r} is no file: it is a line for netem")
         return setting(str(file), "the command line")
     if not file.is_file() or file.stat().st_size < _LONG:
         return read_link(file, options, name)
@@ -79,11 +82,15 @@ def refuse_without_file(file_options: FileOptions) -> None:
     """Raises UserError if an option of `with_link_file` is given to a command that has no measured link to read."""
     from agv_ros.errors import UserError
 
+    if given := _given(file_options):
+        raise UserError(f"{given}: name the file with --link")
+
+
+def _given(file_options: FileOptions) -> str:
+    """Which options are given, as the beginning of a complaint; empty if none is."""
     names = {"format_name": "--format", "columns": "--column"}
     given = [names.get(name, f"--{name}") for name, value in file_options.items() if value]
-    if given:
-        what = "are" if len(given) > 1 else "is"
-        raise UserError(f"{', '.join(given)} {what} about the file of a measured link: name it with --link")
+    return f"{', '.join(given)} {'are' if len(given) > 1 else 'is'} about the file of a measured link" if given else ""
 
 
 def _column(text: str) -> tuple[str, str]:

@@ -96,7 +96,7 @@ def _table(block: Block, malformed: Malformed) -> tuple[Floats, int, int]:
 
 
 def _durations(text: Bytes, places: Places) -> Floats:
-    """Durations of Go with one unit [s], NaN for others."""
+    """Durations of Go [s], as in 1.2ms or 1m2.5s, NaN for others."""
     negative = text[places] == ord("-")
     numbers = numbers_at(text, places + negative)
     unit = np.minimum(places + negative + numbers.length, len(text) - 1)
@@ -107,6 +107,10 @@ def _durations(text: Bytes, places: Places) -> Floats:
     scale[(first == ord("u")) | (first == 0xC2)] = 1e-6  # the sign for micro has two bytes
     scale[first == ord("n")] = 1e-9
     values = numbers.values * scale
+    for letter, seconds in ((ord("m"), 60.0), (ord("h"), 3600.0)):  # before them there are others
+        longer = (first == letter) & (second >= ord("0")) & (second <= ord("9"))
+        if longer.any():
+            values[longer] = seconds * numbers.values[longer] + _durations(text, unit[longer] + 1)
     return np.asarray(np.where(negative, -values, values))
 
 

@@ -334,4 +334,11 @@ def test_a_table_is_read_as_the_options_say(tmp_path: Path, agv_ncs: AgvNcs) -> 
 def test_an_option_about_the_file_needs_the_file(option: str) -> None:
     answer = CliRunner().invoke(main, ["require", str(REPOSITORY / "config/outages.yaml"), option])
     assert (answer.exit_code, answer.output.count("\n")) == (1, 1)
-    assert f"{option.split('=')[0]} is about the file of a measured link: name it with --link" in answer.output
+    assert f"{option.split('=')[0]} is about the file of a measured link: name the file with --link" in answer.output
+
+
+def test_a_line_for_netem_is_no_file(agv_ncs: AgvNcs) -> None:
+    for command in (("link", "loss 5%"), ("require", "config/outages.yaml", "--link", "loss 5%")):
+        status, said = agv_ncs(*command, "--topic", "/edge/pose", "--interval", "0.02")
+        assert (status, said.count("\n")) == (1, 1)
+        assert " are about the file of a measured link, but 'loss 5%' is no file" in said

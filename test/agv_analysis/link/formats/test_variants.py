@@ -255,6 +255,15 @@ def test_the_table_below_irtt_text_says_how_many_packets_were_sent(tmp_path: Pat
     assert "packets after" not in said(found)
 
 
+def test_irtt_text_with_round_trips_of_minutes_and_hours(tmp_path: Path) -> None:
+    text = "seq=0 rtt=1.5ms rd=1ms sd=500µs\nseq=1 rtt=1m2.5s rd=1m1s sd=1.5s\nseq=2 rtt=1h0m0.5s rd=1h0m0s sd=500ms\n"
+    found = read(tmp_path / "a", text)
+    assert found.round_trip is not None
+    assert found.round_trip.delay is not None
+    assert found.round_trip.delay.tolist() == pytest.approx([0.0015, 62.5, 3600.5])
+    assert (lost(found), found.malformed.count) == ([], 0)
+
+
 def test_irtt_states_what_came_twice_or_late(tmp_path: Path) -> None:
     trips: list[object] = [{"seqno": i, "lost": "false", "delay": {"rtt": 1_000_000 + i}} for i in range(6)]
     text = irtt(trips).replace('"round_trips"', '"stats": {"duplicates": 2, "late_packets": 3}, "round_trips"', 1)
