@@ -340,5 +340,5 @@ def test_an_option_about_the_file_needs_the_file(option: str) -> None:
 def test_a_line_for_netem_is_no_file(agv_ncs: AgvNcs) -> None:
     for command in (("link", "loss 5%"), ("require", "config/outages.yaml", "--link", "loss 5%")):
         status, said = agv_ncs(*command, "--topic", "/edge/pose", "--interval", "0.02")
-        assert (status, said.count("\n")) == (1, 1)
+        assert (status, len(said.splitlines())) == (1, 1)
         assert " are about the file of a measured link, but 'loss 5%' is no file" in said
