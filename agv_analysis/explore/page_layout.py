@@ -43,7 +43,7 @@ button { font: inherit; margin: .2rem .3rem .2rem 0; padding: .25rem .6rem }
 th, td { text-align: left; padding: .1rem .8rem .1rem 0; vertical-align: top } textarea { width: 100%; font: inherit }
 pre { white-space: pre-wrap }
 /* Of one height whatever is in it, so that the plots below stay where they are. */
-#badge { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; height: 4.6rem; overflow: hidden }
+#badge { display: grid; grid-template-columns: repeat(3, 1fr); gap: .6rem; height: 5.8rem; overflow: hidden }
 #badge > div {
   border: 1px solid var(--line); border-radius: .4rem; padding: .3rem .6rem; font-size: .8rem; color: var(--soft);
 }
@@ -58,7 +58,7 @@ pre { white-space: pre-wrap }
 /* Lines for the longest usual reason, some 240 letters. */
 #badge-why { height: 2.8em; overflow: auto; font-size: .9rem; color: var(--soft); margin-top: .2rem }
 @media (max-width: 1200px) {
-  #plots { display: block } #plot-track { height: 400px } #badge-why { height: 5.6em }
+  #plots { display: block } #plot-track { height: 400px } #badge-why { height: 5.6em } #badge { height: 7rem }
 }
 #pinned-name, #problem { height: 1.4em; overflow: auto; white-space: pre-wrap; font-size: .9rem; color: var(--soft) }
 #problem { color: var(--bad) }
@@ -75,7 +75,7 @@ pre { white-space: pre-wrap }
   #controls { max-height: 45vh; overflow-y: auto }
   .modebar-container { display: none } /* no room: it would lie on the names of the lines */
   #badge-why { height: 7em; font-size: .8rem }
-  #badge b { font-size: .95rem } #badge > div { padding: .2rem .4rem; font-size: .72rem } #badge { height: 6.4rem }
+  #badge b { font-size: .95rem } #badge > div { padding: .2rem .4rem; font-size: .72rem } #badge { height: 7.6rem }
   th, td { padding-right: .4rem; font-size: .85rem } td { overflow-wrap: anywhere }
 }
 """

@@ -91,7 +91,9 @@ def beside(panel: Panel, pinned: Panel | None) -> Panel:
     if pinned is not None:
         line = next(line for line in pinned.lines if line.role not in (REFERENCE, LIMIT))
         shown += (dataclasses.replace(line, name="pinned", role=PINNED),)
-        panel = dataclasses.replace(panel, y_range=_both(panel.y_range, pinned.y_range))
+        # A logarithmic panel has a range only where a run diverges: it holds what does not, too.
+        both = panel.y_range or pinned.y_range if panel.log else _both(panel.y_range, pinned.y_range)
+        panel = dataclasses.replace(panel, y_range=both)
     return dataclasses.replace(panel, lines=shown)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agv_analysis.metrics.bands import TOLERANCE
-from agv_analysis.metrics.deviation import Peak
+from agv_analysis.metrics.deviation import DIVERGED, Peak
 from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.run import Floats, Run
@@ -164,8 +164,12 @@ def _within(values: Floats, reference: Floats) -> Floats:
 
 
 def distance(run: Run, worst: tuple[Peak, ...] = ()) -> Panel:
-    """Distance between AGV and reference, on a logarithmic axis, its largest peaks after settling marked."""
+    """Distance between AGV and reference, on a logarithmic axis, its largest peaks after settling marked.
+
+    The axis ends where a run has diverged.
+    """
     e = run.reference[:, :2] - run.pose[:, :2]
+    apart = np.maximum(np.hypot(e[:, 0], e[:, 1]), SMALLEST)
     marked: tuple[Line, ...] = ()
     if worst:
         at = np.array([run.time[0] + peak.seconds for peak in worst])
@@ -176,12 +180,13 @@ def distance(run: Run, worst: tuple[Peak, ...] = ()) -> Panel:
         TIME,
         "error [m]",
         (
-            Line("distance", run.time, np.maximum(np.hypot(e[:, 0], e[:, 1]), SMALLEST), DRIVEN),
+            Line("distance", run.time, apart, DRIVEN),
             Line("|y_r - y_c|", run.time, np.maximum(np.abs(e[:, 1]), SMALLEST), OTHER),
             _limit("1 cm", run, TOLERANCE),
             *marked,
         ),
         log=True,
+        y_range=(SMALLEST, DIVERGED) if (apart > DIVERGED).any() else None,
     )
 
 
@@ -243,8 +248,11 @@ def _shown(values: Floats, run: Run, since: float | None) -> tuple[float, float]
 
 
 def _most(values: Floats) -> tuple[float, float] | None:
-    """A range that holds 98 % of the values and a margin: a start far from the track would flatten all the rest."""
-    finite = values[np.isfinite(values)]
+    """A range that holds 98 % of the values and a margin: a start far from the track would flatten all the rest.
+
+    Of a run that diverges, the values until it has.
+    """
+    finite = values[np.abs(values) <= DIVERGED]
     if not finite.size:
         return None
     low, high = np.percentile(finite, [1.0, 99.0])

@@ -167,7 +167,7 @@ def _y_axis(panel: Panel, is_tight: bool) -> dict[str, Any]:
     if panel.equal:
         axis |= {"scaleanchor": "x", "scaleratio": 1} | ({"constrain": "domain"} if is_tight else {})
     if panel.y_range is not None:
-        axis["range"] = list(panel.y_range)
+        axis["range"] = np.log10(panel.y_range).tolist() if panel.log else list(panel.y_range)
     return axis
 
 

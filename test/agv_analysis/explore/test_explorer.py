@@ -557,6 +557,11 @@ def test_the_usual_reasons_are_seen_whole(page: Page, width: int) -> None:
         page.chrome.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         assert fits(page, "badge-why", LONG_REASON)
         assert not fits(page, "badge-why", LONG_REASON * 5)
+        page.click("preset-missed")
+        page.until(lambda: page.text("badge-when") == "of the whole run, since its initial error does not settle")
+        assert page.chrome.execute_script(
+            "const b = document.getElementById('badge'); return b.scrollHeight <= b.clientHeight"
+        )
     finally:
         page.chrome.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 

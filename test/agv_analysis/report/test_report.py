@@ -18,13 +18,15 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
+from agv_analysis.explore.response import beside
 from agv_analysis.metrics.confidence import computed
 from agv_analysis.recordings.recording import read_run
 from agv_analysis.report.cannot_say import cannot_say
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.report.matplotlib_figures import draw_figures
 from agv_analysis.report.page import render, write_report
-from agv_analysis.report.panels import HALOS, LINE, Line, panels, thinned, track
+from agv_analysis.report.panels import HALOS, LINE, Line, distance, panels, speed, thinned, track
+from agv_analysis.report.plotly import figure
 from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
 from agv_analysis.report.table import print_side_by_side, print_table
 from agv_analysis.report.tiles import confidence_text
@@ -533,6 +535,19 @@ def test_a_confidence_is_not_rounded_to_certainty() -> None:
 )
 def test_what_was_computed_is_never_certain(probability: float, said: str) -> None:
     assert computed(probability) == said
+
+
+def test_no_axis_goes_to_absurd_numbers() -> None:
+    """At K_x = 390 the loop diverges: distances to 10^20 m and speeds say no more than that."""
+    run = simulate(scenario_of("controller.kx=390.0", "plant.duration=50.0", "relay.uplink.p=0.1"))
+    assert np.abs(run.command[:, 0]).max() > 1e6
+    drawn = figure([distance(run), speed(run)])
+    assert drawn["layout"]["yaxis"]["range"] == [-6.0, 5.0]  # logarithms of metres
+    assert max(map(abs, drawn["layout"]["yaxis2"]["range"])) < 3e5
+    calm = simulate(scenario_of("plant.duration=5.0"))
+    assert distance(calm).y_range is None
+    panel = beside(distance(calm), distance(run))
+    assert panel.y_range == (1e-6, 1e5)
 
 
 def test_a_thinned_line_keeps_its_peaks_and_ends() -> None:
