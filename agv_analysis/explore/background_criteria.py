@@ -47,7 +47,7 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
     """
     from agv_analysis.corridor.corridor import corridor
     from agv_analysis.report.table import margin_rows
-    from agv_analysis.report.tiles import confidence_text
+    from agv_analysis.report.tiles import how_sure
     from agv_analysis.report.verdict_sentence import sentence
     from agv_analysis.simulation.single import simulate
     from agv_analysis.stability.analysis import analyse
@@ -56,8 +56,8 @@ def criteria_rows(scenario: Scenario) -> list[tuple[str, str]]:
         analysis = analyse(simulate(scenario))
         found = [("Verdict", sentence(analysis)), (WORD, analysis.verdict.word)]
         found.append((WHY, analysis.verdict.reason))
-        if analysis.evidence.confidence is not None:
-            found.append((SURE, confidence_text(analysis.evidence.confidence)))
+        if sure := how_sure(analysis):
+            found.append((SURE, sure))
         if analysis.floquet is not None:
             found.append(("This loss sequence (Floquet)", _growth(analysis.floquet)))
         within = corridor(scenario, _LAPS, proved=False)

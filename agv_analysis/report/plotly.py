@@ -76,6 +76,9 @@ _LEGEND_LINE = 14
 _COLUMN = 22
 """Letters of a name in one line of a column."""
 
+_ROW = 40
+"""Letters of a name that has a row of a legend for itself."""
+
 _MODE_BAR = 32
 """Height of the buttons that plotly.js shows on top of a figure [pixels]."""
 
@@ -131,9 +134,9 @@ def figure(
     return {"data": found, "layout": layout}
 
 
-def _wrapped(name: str) -> list[str]:
-    """A name in lines that fit a column of a legend below a figure, on a phone as well."""
-    return textwrap.wrap(name, _COLUMN, break_long_words=False) or [name]
+def _wrapped(name: str, most: int = _COLUMN) -> list[str]:
+    """A name in lines of so many letters; by default they fit a column of a legend, on a phone as well."""
+    return textwrap.wrap(name, most, break_long_words=False) or [name]
 
 
 def _height_below(names: Sequence[str]) -> int:
@@ -145,7 +148,8 @@ def _height_below(names: Sequence[str]) -> int:
 
 def traces(lines: Sequence[Line], most: int = MOST_POINTS) -> list[dict[str, Any]]:
     """Lines to be added to a figure of one panel."""
-    return [_trace(line, most, MOST_MARKERS) | {"yaxis": "y", "legend": "legend"} for line in lines]
+    found = [_trace(line, most, MOST_MARKERS) | {"yaxis": "y", "legend": "legend"} for line in lines]
+    return [trace | {"name": "<br>".join(_wrapped(trace["name"], _ROW))} for trace in found]
 
 
 def aspect(panel: Panel) -> float:

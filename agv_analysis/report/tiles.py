@@ -11,7 +11,7 @@ from agv_analysis.corridor.corridor_of_run import CorridorOfRun
 from agv_analysis.metrics.confidence import percent_after_of
 from agv_analysis.report.table import metres
 from agv_analysis.stability.analysis import Analysis, Observations
-from agv_analysis.stability.verdict import GREEN
+from agv_analysis.stability.verdict import GREEN, SURE
 
 
 class Tile(NamedTuple):
@@ -49,8 +49,15 @@ def _word(analysis: Observations) -> tuple[str, str]:
         return "none", "messages are missing"
     if not isinstance(analysis, Analysis):
         return "none", "the gains are not known"
+    return analysis.verdict.word, how_sure(analysis)
+
+
+def how_sure(analysis: Analysis) -> str:
+    """How probable a stable loop is; empty where that is not asked, or where no losses make the loop what it is."""
     confidence = analysis.evidence.confidence
-    return analysis.verdict.word, "" if confidence is None else confidence_text(confidence)
+    if confidence is None or (confidence >= SURE and analysis.verdict.word not in GREEN):
+        return ""
+    return confidence_text(confidence)
 
 
 def confidence_text(probability: float) -> str:

@@ -29,7 +29,7 @@ from agv_analysis.report.panels import HALOS, LINE, Line, distance, panels, spee
 from agv_analysis.report.plotly import figure
 from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
 from agv_analysis.report.table import print_side_by_side, print_table
-from agv_analysis.report.tiles import confidence_text
+from agv_analysis.report.tiles import confidence_text, how_sure, tiles
 from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation.single import simulate
@@ -535,6 +535,14 @@ def test_a_confidence_is_not_rounded_to_certainty() -> None:
 )
 def test_what_was_computed_is_never_certain(probability: float, said: str) -> None:
     assert computed(probability) == said
+
+
+def test_an_unstable_loop_is_not_called_surely_stable() -> None:
+    """No pose is lost, so that losses leave it stable, but each is 13 steps old: that is too old."""
+    late = analyse(simulate(scenario_of("relay.uplink.delay=0.065", "error_detector.track=line", config="paper")))
+    assert late.verdict.word == "unstable"
+    assert next(tiles(late)).note == ""
+    assert how_sure(analyse(simulate(scenario_of(config="paper")))) == "stable with a probability of 100 %"
 
 
 def test_no_axis_goes_to_absurd_numbers() -> None:
