@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -191,7 +192,7 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from agv_analysis.runtime.fleet import instability
+    from agv_analysis.report.table import print_framed
 
     table = Table(box=None, pad_edge=False)
     table.add_column("AGV", no_wrap=True)
@@ -201,21 +202,63 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     for one in vehicles:
         table.add_row(
             one.vehicle, str(one.steps), _text(one.loss_rate, ".2%"), _text(one.longest_outage, "d"),
-            _text(one.settle_1cm_steps, "d"), _text(None if one.deviation is None else one.deviation["max"], ".3g"),
+            _text(one.settle_1cm_steps, "d"), "-" if one.deviation is None else _deviation(one).removesuffix(" m"),
             _text(one.corridor_share, ".0%"), _text(one.contraction, ".2g"),
             one.verdict or "-",
         )  # fmt: skip
-    console, found = Console(highlight=False), instability(vehicles)
+    console = Console(highlight=False)
+    if headlines := list(_headlines(vehicles)):
+        print_framed(console, headlines)
     console.print(table)
-    if found.judged:
+    if any(one.unstable is not None for one in vehicles):
         console.print(
             "Twins: how far apart two AGVs end that begin a micrometre apart and meet the losses of this run, as a "
             "multiple of that."
         )
-        console.print(
-            f"Unstable: {found.unstable} of {found.judged} AGVs, {found.fraction:.1%} "
-            f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
+
+
+def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
+    """What the fleet does, and which AGV is the reason, with rich's markup; nothing without recordings."""
+    from rich.markup import escape
+
+    from agv_analysis.report.table import colour_of
+    from agv_analysis.runtime.fleet import instability
+    from agv_analysis.stability.verdict import WORDS
+    from agv_analysis.sweep.verdicts import counted
+
+    judged = [one for one in vehicles if one.verdict is not None]
+    if judged:
+        worst = max(judged, key=lambda one: WORDS.index(one.verdict))
+        words = counted([{"verdict": one.verdict} for one in judged])
+        yield "Verdict", f"[{colour_of(str(worst.verdict))}]{words}[/]"
+        yield "Worst", escape(f"{worst.vehicle}: {worst.verdict}, {worst.verdict_reason}")
+    if strayed := [one for one in vehicles if one.deviation is not None]:
+        farthest = max(strayed, key=_largest)
+        yield "Deviation", f"largest: {_deviation(farthest)} ({farthest.vehicle})"
+    if used := {one.vehicle: one.corridor_share for one in vehicles if one.corridor_share is not None}:
+        most = max(used, key=lambda name: used[name])
+        yield "Corridor", f"{used[most]:.0%} of it used at most ({most})"
+    found = instability(vehicles)
+    if found.judged:
+        yield (
+            "Unstable",
+            (
+                f"{found.unstable} of {found.judged} AGVs, {found.fraction:.1%} "
+                f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
+            ),
         )
+
+
+def _largest(one: Vehicle) -> float:
+    """The largest deviation of a vehicle [m], inf of one that diverges, of which there is no number."""
+    largest = None if one.deviation is None else one.deviation["max"]
+    return math.inf if largest is None else float(largest)
+
+
+def _deviation(one: Vehicle) -> str:
+    from agv_analysis.report.table import metres
+
+    return metres(_largest(one))
 
 
 def _text(value: float | None, form: str) -> str:

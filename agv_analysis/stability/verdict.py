@@ -27,6 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from agv_analysis.metrics.deviation import DIVERGED
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence
 from agv_analysis.stability.driven_commands import DrivenCommands
 from agv_analysis.stability.repeated_run import RepeatedRun
@@ -280,6 +281,8 @@ def _against_stability(evidence: Evidence) -> str:
         if not repeated.settles:
             what = repeated.unsettled or "the loop does not settle on its nominal motion"
             return f"simulated without any loss {what}"
+        if not repeated.stays and repeated.largest_deviation > DIVERGED:
+            return "simulated under these losses again and again the AGV diverges"
         if not repeated.stays:
             return (
                 "simulated under these losses again and again the deviation grows, to "
