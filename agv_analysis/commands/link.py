@@ -14,7 +14,6 @@ from agv_analysis.commands.link_file import FileOptions, read_link_file, with_li
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from typing_extensions import Unpack
 
     from agv_analysis.link.link_figures import DirectionFigures, LinkFigures, Spread
     from agv_analysis.link.measurement import LossRates, Measurement, Setting
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 @with_force
 def command(
     file: Path, params: str | None, settings: tuple[str, ...], corridor: float | None, rtt: str, trace: Path | None,
-    picture: Path | None, json_file: Path | None, **file_options: Unpack[FileOptions],
+    picture: Path | None, json_file: Path | None, **of_file: Any,
 ) -> None:  # fmt: skip
     """Show what FILE says of a link: output of ping, irtt, owping, iperf3, a capture, a table, a bag, a line for netem.
 
@@ -59,7 +58,7 @@ def command(
     if params is None and (settings or corridor is not None):
         raise click.UsageError("--set and --corridor are about the loop of a params file: give PARAMS behind FILE")
     scenario = None if params is None else load_scenario(params, (*settings, *corridor_settings(corridor, None)))
-    reading = read_link_file(file, file_options)
+    reading = read_link_file(file, FileOptions(**of_file))
     console = Console(highlight=False)
     if isinstance(reading, Setting):
         found = _setting(console, reading, scenario)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -18,7 +19,8 @@ _LONG = 2**25
 """Files of more bytes than this are read under a progress bar."""
 
 
-class FileOptions(TypedDict):
+@dataclass(frozen=True)
+class FileOptions:
     """What the options of `with_link_file` say, by the names that a command gets them by."""
 
     format_name: str
@@ -27,6 +29,13 @@ class FileOptions(TypedDict):
     delimiter: str
     topic: str
     received: Path | None
+
+    def given(self) -> str:
+        """Which of them are given, as the beginning of a complaint; empty if none is."""
+        flags = {"format_name": "--format", "columns": "--column"}
+        found = [flags.get(one.name, f"--{one.name}") for one in fields(self) if getattr(self, one.name)]
+        are = "are" if len(found) > 1 else "is"
+        return f"{', '.join(found)} {are} about the file of a measured link" if found else ""
 
 
 def with_link_file(command: F) -> F:
@@ -52,7 +61,7 @@ def with_link_file(command: F) -> F:
     return command
 
 
-def read_link_file(file: Path, file_options: FileOptions) -> Reading:
+def read_link_file(file: Path, of_file: FileOptions) -> Reading:
     """Read a measured link, a long file under a progress bar. Raises MeasurementError for one that is none."""
     from agv_analysis.commands.progress import step_bar
     from agv_analysis.link.formats import read_link
@@ -61,36 +70,24 @@ def read_link_file(file: Path, file_options: FileOptions) -> Reading:
     from agv_analysis.link.measurement import MeasurementError
     from agv_analysis.link.netem_text import is_netem
 
-    columns = dict(map(_column, file_options["columns"]))
-    options = Options(
-        file_options["interval"], columns, file_options["delimiter"], file_options["topic"], file_options["received"]
-    )
-    name = file_options["format_name"]
+    columns, name = dict(map(_column, of_file.columns)), of_file.format_name
+    options = Options(of_file.interval, columns, of_file.delimiter, of_file.topic, of_file.received)
     if is_netem(str(file)) and not os.path.exists(file):  # noqa: PTH110  # Path.exists minds what is too long for a name
-        if given := _given(file_options):
+        if given := of_file.given():
             raise MeasurementError(f"{given}, but {str(file)!r} is no file: it is a line for netem")
         return setting(str(file), "the command line")
     if not file.is_file() or file.stat().st_size < _LONG:
         return read_link(file, options, name)
-    from dataclasses import replace
-
     with step_bar(100, "reading") as progress:
         return read_link(file, replace(options, progress=lambda share: progress(round(100 * share))), name)
 
 
-def refuse_without_file(file_options: FileOptions) -> None:
+def refuse_without_file(of_file: FileOptions) -> None:
     """Raises UserError if an option of `with_link_file` is given to a command that has no measured link to read."""
     from agv_ros.errors import UserError
 
-    if given := _given(file_options):
+    if given := of_file.given():
         raise UserError(f"{given}: name the file with --link")
-
-
-def _given(file_options: FileOptions) -> str:
-    """Which options are given, as the beginning of a complaint; empty if none is."""
-    names = {"format_name": "--format", "columns": "--column"}
-    given = [names.get(name, f"--{name}") for name, value in file_options.items() if value]
-    return f"{', '.join(given)} {'are' if len(given) > 1 else 'is'} about the file of a measured link" if given else ""
 
 
 def _column(text: str) -> tuple[str, str]:

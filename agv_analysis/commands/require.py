@@ -13,8 +13,6 @@ from agv_analysis.commands.link_file import FileOptions, read_link_file, refuse_
 from agv_analysis.output_file import MARKDOWN_MARK, output_file
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from agv_analysis.requirements.link_availability import LinkAvailability
     from agv_analysis.requirements.loop_requirements import LoopRequirements
     from agv_analysis.requirements.offered_service import OfferedService
@@ -47,7 +45,7 @@ def command(
     params: str, settings: tuple[str, ...], corridor: float | None, corridor_along: float | None, file: Path | None,
     name: str | None, files: tuple[Path, ...], availability: float | None, mtbf: float | None,
     survival_time: float | None, transfer_interval: float | None, latency: float | None, table: Path | None,
-    report: Path | None, json_file: Path | None, **file_options: Unpack[FileOptions],
+    report: Path | None, json_file: Path | None, **of_file: Any,
 ) -> None:  # fmt: skip
     """Say what the loop of the params file PARAMS asks of its radio, in the words of those who plan radios.
 
@@ -82,7 +80,7 @@ def command(
             "--transfer-interval is offered with a --survival-time, --availability, --mtbf or --class: give one"
         )
     if file is None:
-        refuse_without_file(file_options)
+        refuse_without_file(FileOptions(**of_file))
     scenario = load_scenario(params, (*settings, *corridor_settings(corridor, corridor_along)))
     classes = load_classes(*files)
     if name is not None:
@@ -94,7 +92,7 @@ def command(
     console = Console(highlight=False)
     with Console(stderr=True).status("computing what the loop asks ..."):
         loop = require(scenario)
-    link = _link_of(scenario, loop, file, file_options)  # which may have a progress bar of its own
+    link = _link_of(scenario, loop, file, FileOptions(**of_file))  # which may have a progress bar of its own
     enough = {one.name: would_do(one, loop) for one in classes}
     met = {one.name: meets(one, link) for one in classes}
     sections: dict[str, list[tuple[str, ...]]] = {"What the loop asks of its radio": list(rows_of_loop(loop))}
@@ -143,7 +141,7 @@ def _asked(availability: float | None, mtbf: float | None) -> ServiceClass:
 
 
 def _link_of(
-    scenario: Scenario, loop: LoopRequirements, file: Path | None, file_options: FileOptions
+    scenario: Scenario, loop: LoopRequirements, file: Path | None, of_file: FileOptions
 ) -> LinkAvailability | None:
     """What the measured link gives, or the scenario's uplink; None where nothing is known of it, or of the loop."""
     from agv_analysis.link.link_figures import LinkFigures
@@ -156,7 +154,7 @@ def _link_of(
     slots = loop.survival_slots
     uplink = scenario.relay.uplink
     if file is not None:
-        reading = read_link_file(file, file_options)
+        reading = read_link_file(file, of_file)
         if isinstance(reading, LossRates):
             raise UserError(reading.refusal)
         if isinstance(reading, Measurement):
