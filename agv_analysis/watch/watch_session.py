@@ -35,7 +35,7 @@ TICK = 0.05
 _LEAD = 0.4
 """An outage that is asked for begins at least this much later [s], when the relay should know of it."""
 
-_LEAST_REST, _SHARE = 4.0, 9.0
+_LEAST_REST, _SHARE = 5.0, 9.0
 """Between two margins pass so many seconds and so many times what the last one took: a tenth of a core at most."""
 
 _QUIET = 1.0
