@@ -210,6 +210,8 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
     if headlines := list(_headlines(vehicles)):
         print_framed(console, headlines)
     console.print(table)
+    if worst := _worst(vehicles):
+        console.print(f"{worst.vehicle}: [bold]{worst.verdict}[/], {escape(str(worst.verdict_reason))}.")
     if any(one.unstable is not None for one in vehicles):
         console.print(
             "Twins: how far apart two AGVs end that begin a micrometre apart and meet the losses of this run, as a "
@@ -219,19 +221,13 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
 
 def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
     """What the fleet does, and which AGV is the reason, with rich's markup; nothing without recordings."""
-    from rich.markup import escape
-
     from agv_analysis.report.table import colour_of
     from agv_analysis.runtime.fleet import instability
-    from agv_analysis.stability.verdict import WORDS
     from agv_analysis.sweep.verdicts import counted
 
-    judged = [one for one in vehicles if one.verdict is not None]
-    if judged:
-        worst = max(judged, key=lambda one: WORDS.index(one.verdict))
-        words = counted([{"verdict": one.verdict} for one in judged])
+    if worst := _worst(vehicles):
+        words = counted([{"verdict": one.verdict} for one in vehicles])
         yield "Verdict", f"[{colour_of(str(worst.verdict))}]{words}[/]"
-        yield "Worst", escape(f"{worst.vehicle}: {worst.verdict}, {worst.verdict_reason}")
     if strayed := [one for one in vehicles if one.deviation is not None]:
         farthest = max(strayed, key=_largest)
         yield "Deviation", f"largest: {_deviation(farthest)} ({farthest.vehicle})"
@@ -247,6 +243,14 @@ def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
                 f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
             ),
         )
+
+
+def _worst(vehicles: list[Vehicle]) -> Vehicle | None:
+    """The first one with the worst word, None if none has a word."""
+    from agv_analysis.stability.verdict import WORDS
+
+    judged = [one for one in vehicles if one.verdict is not None]
+    return max(judged, key=lambda one: WORDS.index(str(one.verdict)), default=None)
 
 
 def _largest(one: Vehicle) -> float:
