@@ -329,12 +329,7 @@ def rates_to_json(found: LossRates) -> dict[str, Any]:
         ROUND_TRIP: _untold(),
         "outage_max_s": None,
         "delay": dict.fromkeys(("of", *_KEYS)),
-        "jitter": dict.fromkeys(("of", *_KEYS)),
-        "duplicates": None,
-        "reordered": None,
-        "malformed": None,
-        "fit": None,
-        "stationarity": None,
+        **_of_packets(),
         "intervals": [
             {"begin_s": begin, "end_s": end, "packets": packets, "lost": lost}
             for begin, end, packets, lost in zip(
@@ -344,6 +339,12 @@ def rates_to_json(found: LossRates) -> dict[str, Any]:
         "no_trace_because": found.refusal,
         "notes": list(found.notes),
     }
+
+
+def _of_packets() -> dict[str, Any]:
+    """What only packets, one by one, would tell: nothing."""
+    unknown = dict.fromkeys(("duplicates", "reordered", "malformed", "fit", "stationarity"))
+    return {"jitter": dict.fromkeys(("of", *_KEYS)), **unknown}
 
 
 def setting_to_json(found: Setting) -> dict[str, Any]:
@@ -363,12 +364,7 @@ def setting_to_json(found: Setting) -> dict[str, Any]:
         ROUND_TRIP: _untold(),
         "outage_max_s": None,
         "delay": {"of": UPLINK, **_delays_set(found.channel)},
-        "jitter": dict.fromkeys(("of", *_KEYS)),
-        "duplicates": None,
-        "reordered": None,
-        "malformed": None,
-        "fit": None,
-        "stationarity": None,
+        **_of_packets(),
         "notes": [],
         "channel": {name: values[name] for name in changed},
         "exact": not found.differences,
