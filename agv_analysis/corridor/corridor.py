@@ -18,7 +18,7 @@ from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stat
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
-from agv_analysis.metrics.confidence import percent
+from agv_analysis.metrics.confidence import computed, percent
 from agv_analysis.metrics.duration_text import duration_text
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
@@ -324,7 +324,7 @@ def probability(p: Estimate) -> str:
 
 def in_an_hour(lap: Estimate, hour: Estimate) -> str:
     """The probability of an hour, which floats round to 1 where that of a lap is not."""
-    return "above 99.9 %" if hour.low == 1.0 and lap.low < 1.0 else probability(hour)
+    return computed(hour.value) if hour.low == 1.0 and lap.low < 1.0 else probability(hour)
 
 
 def _time(mean: Estimate | None) -> str:

@@ -281,13 +281,10 @@ def _against_stability(evidence: Evidence) -> str:
         if not repeated.settles:
             what = repeated.unsettled or "the loop does not settle on its nominal motion"
             return f"simulated without any loss {what}"
-        if not repeated.stays and repeated.largest_deviation > DIVERGED:
-            return "simulated under these losses again and again the AGV diverges"
         if not repeated.stays:
-            return (
-                "simulated under these losses again and again the deviation grows, to "
-                f"{repeated.largest_deviation:.3g} m after {repeated.seconds:.0f} s"
-            )
+            far = f"the deviation grows, to {repeated.largest_deviation:.3g} m after {repeated.seconds:.0f} s"
+            becomes = "the AGV diverges" if repeated.largest_deviation > DIVERGED else far
+            return f"simulated under these losses again and again {becomes}"
         if not repeated.meets:
             return "simulated under these losses, an AGV that begins on the track and this one do not come together"
     if twins is not None and twins[0] < _SURE_OF_RUNS * twins[1]:

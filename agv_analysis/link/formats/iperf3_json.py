@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.link.formats.format import Format, Options
+from agv_analysis.link.formats.rows import MOST_EXACT
 from agv_analysis.link.formats.text_columns import open_binary
 from agv_analysis.link.measurement import LossRates, MeasurementError, needs_memory
 from agv_ros.json_text import parse_json
@@ -20,9 +21,6 @@ _EXPANDS = 4
 """Bytes in memory of a byte of JSON, at least."""
 
 Row = tuple[float, float, int, int]
-
-_LARGEST = 2**53
-"""Figures from here on are none of a test."""
 
 
 def _matches(head: bytes, path: Path) -> bool:
@@ -80,7 +78,7 @@ def _row(found: dict[str, Any]) -> Row | None:
         row = float(found["start"]), float(found["end"]), int(found["packets"]), int(found["lost_packets"])
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
-    return row if -_LARGEST < row[0] < row[1] < _LARGEST and 0 <= row[3] <= row[2] < _LARGEST else None
+    return row if -MOST_EXACT < row[0] < row[1] < MOST_EXACT and 0 <= row[3] <= row[2] < MOST_EXACT else None
 
 
 FORMAT = Format("iperf3", "JSON of iperf3 -u -J", 20, _matches, _read)
