@@ -15,6 +15,9 @@ comma := ,
 
 export PYTEST_DISABLE_PLUGIN_AUTOLOAD = 1
 
+# The tests start hundreds of processes. Without byte code on disk, each would compile every module of numba again: 3 s.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test coverage bench growth fuzz torture dist lowest pythons docs site images sample clean
 
 demo: $(VENV)/run.stamp ## the paper's scenario with outages: run, record, analyse
