@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +21,7 @@ from agv_analysis.stability.verdict import BOUNDED, GREEN, UNDECIDED, UNKNOWN
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
 _YELLOW = (BOUNDED, UNDECIDED, UNKNOWN)
 
@@ -51,15 +53,53 @@ def print_table(analysis: Observations) -> None:
 
 
 def print_framed(console: Console, headlines: Iterable[tuple[str, str]]) -> None:
-    """Print names and values, text with rich's markup, in a frame: what a command answers first."""
+    """Print names and values, text with rich's markup, in a frame: what a command answers first.
+
+    It has at most five lines. A longer value is cut off after a clause; the whole is the business of a table below.
+    """
     from rich.panel import Panel
     from rich.table import Table
 
     frame = Table.grid(padding=(0, 2))
     frame.add_column(style="bold")
-    for name, value in headlines:
+    for name, value in _shortened(console, list(headlines)):
         frame.add_row(name, value)
     console.print(Panel(frame, expand=False))
+
+
+def _shortened(console: Console, headlines: Sequence[tuple[str, str]]) -> list[tuple[str, Text]]:
+    """The headlines, the longest of them cut off after a clause until all fit into the lines of a frame."""
+    from rich.text import Text
+
+    width = console.width - _FRAME_WIDTH - max((len(name) for name, _ in headlines), default=0)
+    found = [(name, Text.from_markup(value)) for name, value in headlines]
+
+    def lines(text: Text) -> int:
+        return len(text.wrap(console, max(width, 1)))
+
+    while sum(lines(text) for _, text in found) > _FRAME_LINES:
+        longest = max(range(len(found)), key=lambda i: lines(found[i][1]))
+        name, text = found[longest]
+        end = max((clause.start() for clause in _CLAUSE.finditer(text.plain.removesuffix(_CUT))), default=0)
+        if end == 0:
+            break  # a narrow terminal: no clause ends early enough
+        shorter = text[:end]
+        shorter.append(_CUT)
+        found[longest] = name, shorter
+    return found
+
+
+_FRAME_LINES = 5
+"""Most lines of a frame."""
+
+_FRAME_WIDTH = 6
+"""What a frame's border and the space between its columns take [characters]."""
+
+_CLAUSE = re.compile(r"[;:,]\s|\s\(")
+"""Where a clause of a value ends."""
+
+_CUT = " ..."
+"""Stands for the clauses that have been cut off."""
 
 
 def print_groups(console: Console, groups: Iterable[tuple[str, Iterable[tuple[str, str]]]]) -> None:

@@ -246,7 +246,7 @@ def _not_stable(evidence: Evidence, criterion: str, why: str) -> Verdict:
         f"{repeated.seconds:.0f} s of simulation"
     )
     return Verdict(
-        BOUNDED, SIMULATION if criterion == SIMULATION else "v_max", f"none: {why}; {only}", f"{why}; {only}"
+        BOUNDED, SIMULATION if criterion == SIMULATION else "v_max", f"none: {only}; {why}", f"{only}; {why}"
     )
 
 

@@ -536,9 +536,9 @@ def test_the_address_holds_the_setting(page: Page, address: str) -> None:
 
 
 LONG_REASON = (
-    "Why: the mean square of the error grows: a Gilbert channel describes the outcomes, of 205 complete outages (the "
-    "error dies out with a probability below 0.1 %); only the limit on the speed bounds the error, at 0.321 m in 600 s "
-    "of simulation."
+    "Why: only the limit on the speed bounds the error, at 0.321 m in 600 s of simulation; the mean square of the "
+    "error grows: a Gilbert channel describes the outcomes, of 205 complete outages (the error dies out with a "
+    "probability below 0.1 %)."
 )
 """The explorer's answer to K_x = 250 and v_max = 3 on config/outages.yaml."""
 
