@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -81,10 +82,16 @@ def _open_all(items: list[Item], is_large: bool) -> list[Opened | DamagedError |
 
 
 def open_ahead(items: Iterator[Item], is_large: bool) -> Iterator[tuple[Item, Opened | DamagedError | None]]:
-    """The same items, a few chunks ahead being opened on another thread."""
+    """The same items, a few chunks ahead being opened on another thread; in place what is too little for that."""
+    parts = _together(items)
+    beginning = list(itertools.islice(parts, 2))
+    if len(beginning) < 2:
+        for some in beginning:
+            yield from zip(some.items, _open_all(some.items, is_large), strict=True)
+        return
     waiting: deque[tuple[_Some, Future[list[Opened | DamagedError | None]]]] = deque()
     with ThreadPoolExecutor(1, "bag") as pool:
-        for some in _together(items):
+        for some in itertools.chain(beginning, parts):
             waiting.append((some, pool.submit(_open_all, some.items, is_large)))
             while len(waiting) > 1 and sum(ahead.size for ahead, _ in waiting) > _AHEAD:
                 ready, opened = waiting.popleft()
