@@ -27,6 +27,7 @@ from agv_analysis.bags.schema import short_name
 from agv_analysis.bags.storage import Storage, is_large
 from agv_analysis.bags.topic_types import TopicTypes
 from agv_analysis.bags.type_hash import contradicts
+from agv_ros.counted import counted
 
 _MOST_EXPECTED = 2
 """Messages a byte of the file for which room is made at once, whatever number a damaged file states.
@@ -293,7 +294,10 @@ class _Reading:
         """Give up a definition from elsewhere that does not describe most messages of a topic."""
         found = self._counts[topic]
         if isinstance(table, Table) and found and 2 * table.misfits >= found:
-            about = f"that of {self._borrowed[topic].source} does not describe {table.misfits} of its {found} messages"
+            about = (
+                f"that of {self._borrowed[topic].source} does not describe {table.misfits} of its "
+                f"{counted(found, 'message')}"
+            )
             self._refuse(topic, UndecodableError(f"{UNDEFINED}, and {about}"))
 
     def bag(self, path: Path) -> Bag:

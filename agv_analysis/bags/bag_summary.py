@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from agv_analysis.bags.bag import Attached, Bag, Topic
 from agv_analysis.bags.layout import length_path
 from agv_analysis.bags.topic_times import Silence, StampClock, periods_of, silences, stamp_clock
+from agv_ros.counted import counted
 
 _MOST_SILENCES = 5
 """Silences that are printed; all of them are in the JSON."""
@@ -78,7 +79,7 @@ class BagSummary:
         total = sum(topic.messages for topic in self.topics)
         times = [time for topic in self.topics for time in (topic.first, topic.last) if time is not None]
         by = f", recorded by ROS 2 {self.distro}" if self.distro else ""
-        yield f"{self.path}: {total} messages on {len(self.topics)} topics{by}"
+        yield f"{self.path}: {counted(total, 'message')} on {counted(len(self.topics), 'topic')}{by}"
         if times:
             yield f"from {_date(min(times))} on, for {max(times) - min(times):.3f} s"
         yield from _table([_HEAD, *(_cells(topic) for topic in self.topics)])
@@ -88,7 +89,7 @@ class BagSummary:
             yield from _table([_CLOCK_HEAD, *clocks])
             yield ""
         for service in self.services:
-            yield f"service {service.name} ({service.type}): {service.events} events"
+            yield f"service {service.name} ({service.type}): {counted(service.events, 'event')}"
         for item in self.attachments:
             yield f"attachment {item.name} ({item.media_type}): {item.size} bytes, of {_date(item.log_time_ns / 1e9)}"
         for name, content in self.metadata.items():

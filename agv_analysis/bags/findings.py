@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from agv_ros.counted import counted
 from agv_ros.printable import printable
 
 
@@ -57,5 +58,5 @@ class Findings:
 
 def _text(what: str, kind: _Kind) -> str:
     where = "" if kind.first is None else f", the first at byte {kind.first}"
-    messages = f", with {kind.messages} messages" if kind.messages else ""
+    messages = f", with {counted(kind.messages, 'message')}" if kind.messages else ""
     return f"{what}: {kind.count}{where}{messages}"

@@ -17,6 +17,7 @@ from agv_analysis.bags.layout import LOG_TIME, PUBLISH_TIME, Index, Layout, Leaf
 from agv_analysis.bags.message_batch import Batch, Bytes, Group, Ints, Layouts, values_at
 from agv_analysis.bags.prefault import Prefault
 from agv_analysis.bags.schema import PLACEHOLDER, STRING, Struct, is_wstring
+from agv_ros.counted import counted
 
 _MISFITS_BELIEVED = 100
 """After this many messages, none of which is of its type, the definition is not theirs."""
@@ -56,7 +57,7 @@ def refuse_padding(needed: int, message_bytes: int, rows: int) -> None:
     """Raise PaddingError if an array would take `needed` bytes, out of all proportion to its messages."""
     if needed > most_bytes(message_bytes):
         raise PaddingError(
-            f"its strings or sequences differ so much in length that {rows} messages would take "
+            f"its strings or sequences differ so much in length that {counted(rows, 'message')} would take "
             f"{needed / 2**20:.0f} MiB as an array"
         )
 

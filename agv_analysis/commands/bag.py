@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from agv_analysis.commands import OUTPUT, with_force, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from agv_analysis.bags import Bag
@@ -120,8 +121,8 @@ def recover(bag: Path, out: Path, definitions: Path | None) -> None:
     with _bar(bag, "copying") as progress:
         recovery = recover_bag(bag, out, progress, definitions)
     for topic, count in recovery.counts.items():
-        click.echo(f"{printable(topic)}: {count} messages")
-    click.echo(f"{out}: {sum(recovery.counts.values())} messages")
+        click.echo(f"{printable(topic)}: {counted(count, 'message')}")
+    click.echo(f"{out}: {counted(sum(recovery.counts.values()), 'message')}")
     _warn(recovery.problems, recovery.is_complete)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from agv_analysis.commands import OUTPUT, with_force, with_settings, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from agv_analysis.link.channel_study import ChannelStudy
@@ -86,7 +87,8 @@ def command(
         table.add_row(*row)
     console = Console(highlight=False)
     console.print(
-        f"[bold]{link}[/]: {setting(found)}, {slots} slots of {1e3 * relay.ts:g} ms, seed {relay.seed}", soft_wrap=True
+        f"[bold]{link}[/]: {setting(found)}, {counted(slots, 'slot')} of {1e3 * relay.ts:g} ms, seed {relay.seed}",
+        soft_wrap=True,
     )
     console.print(table)
     if csv_file is not None:
@@ -129,7 +131,7 @@ def rows(found: ChannelStudy) -> Iterator[tuple[str, str, str]]:
 
     yield pair("Loss rate", outages.loss_rate, theory.loss_rate, "")
     yield pair("Mean outage", outages.mean_burst, theory.mean_burst, " slots")
-    yield "Longest outage", f"{outages.longest} slots", "-"
+    yield "Longest outage", counted(outages.longest, "slot"), "-"
     yield pair("Mean n_ul", outages.age.mean, theory.mean_age, " slots")
     if found.channel.delays:
         yield pair("Late", found.late, None, " of what is not lost")

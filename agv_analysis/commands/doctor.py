@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import OutputFile, with_force, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from agv_analysis.doctor.examination import Examination
@@ -76,7 +77,7 @@ def _rows(found: Examination) -> Iterator[tuple[str, str]]:
         absent = f"; missing: {', '.join(packages['missing'])}" if packages["missing"] else ""
         yield f"[{extra}]" if extra else "packages", (", ".join(versions) or "none") + absent
     size = sum(one.size for one in found.leftovers)
-    yield "leftovers", f"{len(found.leftovers)} files, {size / 1e6:.1f} MB" if found.leftovers else "none"
+    yield "leftovers", f"{counted(len(found.leftovers), 'file')}, {size / 1e6:.1f} MB" if found.leftovers else "none"
     if found.loop is not None:
         yield from _loop(found.loop)
 
@@ -106,7 +107,7 @@ def _loop(loop: TimedLoop) -> Iterator[tuple[str, str]]:
     if loop.failure:
         yield "loop", f"{loop.what}: failed"
         return
-    yield "loop", f"{loop.what}: {loop.steps} steps, {loop.jitter['missed deadlines']:.0f} deadlines missed"
+    yield "loop", f"{loop.what}: {counted(loop.steps, 'step')}, {loop.jitter['missed deadlines']:.0f} deadlines missed"
     yield "jitter", _quantiles({name.removeprefix("jitter "): value for name, value in loop.jitter.items()})
     if loop.round_trip:
         yield "round trip", _quantiles(loop.round_trip)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import OUTPUT, needs_ros, with_force, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from agv_analysis.identify.bearable_gains import BearableGains
@@ -110,7 +111,7 @@ def _record(bag: Path, names: RobotTopics, seconds: float) -> None:
     with Progress(console=Console(stderr=True)) as progress:
         task = progress.add_task(f"recording {' and '.join(topics)}", total=seconds)
         counts = record_topics(bag, topics, seconds, lambda heard: progress.update(task, completed=heard))
-    recorded = ", ".join(f"{count} messages of {topic}" for topic, count in zip(topics, counts, strict=True))
+    recorded = ", ".join(f"{counted(count, 'message')} of {topic}" for topic, count in zip(topics, counts, strict=True))
     click.echo(f"bag: {bag} ({recorded})")
 
 

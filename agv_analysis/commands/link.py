@@ -11,6 +11,7 @@ import click
 
 from agv_analysis.commands import OUTPUT, corridor_settings, with_force, write_json
 from agv_analysis.commands.link_file import FileOptions, read_link_file, with_link_file
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -101,7 +102,8 @@ def _rates(console: Console, found: LossRates) -> dict[str, Any]:
 
     rate = rate_of(found)
     console.print(
-        f"[bold]{found.source}[/]: {found.format}, {int(found.packets.sum())} packets in {len(found.packets)} "
+        f"[bold]{found.source}[/]: {found.format}, {counted(int(found.packets.sum()), 'packet')} in "
+        f"{len(found.packets)} "
         f"intervals, {_percent(rate.value)} lost (95 %: {_percent(rate.low)} to {_percent(rate.high)})",
         soft_wrap=True,
     )
@@ -126,7 +128,8 @@ def show_measurement(
     with _busy("working out the figures ..."):
         figures = found.to_json()
     console.print(
-        f"[bold]{escape(measured.source)}[/]: {measured.format}, {measured.packets} packets in {measured.span:.6g} s, "
+        f"[bold]{escape(measured.source)}[/]: {measured.format}, {counted(measured.packets, 'packet')} in "
+        f"{measured.span:.6g} s, "
         f"one every {1e3 * measured.interval:.4g} ms",
         soft_wrap=True,
     )
@@ -189,7 +192,7 @@ def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
         f"The loop {how}: [bold {colour_of(verdict.word)}]{verdict.word}[/], {escape(verdict.reason)}", soft_wrap=True
     )
     largest, count = float(driven.deviations.max()), len(driven.deviations)
-    runs = f"a run of {driven.seconds:g} s" if count == 1 else f"{count} runs of {driven.seconds:g} s"
+    runs = f"a run of {driven.seconds:g} s" if count == 1 else f"{counted(count, 'run')} of {driven.seconds:g} s"
     far = f"up to {largest:.3g} m from its reference" if np.isfinite(largest) else "without bound"
     median = "" if count == 1 else f", the median run up to {float(np.median(driven.deviations)):.3g} m"
     console.print(f"  Deviation in {runs}: {far}{median}", soft_wrap=True)
@@ -198,7 +201,8 @@ def _print_driven(console: Console, how: str, driven: ThroughLink) -> None:
     if driven.corridor:
         leaves = driven.leaves
         console.print(
-            f"  Further off than {driven.corridor:g} m: {driven.left} of {count} runs (95 %: {leaves.low:.3g} to "
+            f"  Further off than {driven.corridor:g} m: {driven.left} of {counted(count, 'run')} (95 %: "
+            f"{leaves.low:.3g} to "
             f"{leaves.high:.3g} of them)",
             soft_wrap=True,
         )
@@ -262,6 +266,8 @@ def sentences(found: LinkFigures) -> Iterator[str]:
     else:
         yield f"The link did not change while it was measured (p-value {found.stationarity.p_value:.3g})."
     if measured.duplicates or measured.reordered:
-        yield f"{measured.duplicates} packets came twice, {measured.reordered} after one that was sent later."
+        yield (
+            f"{counted(measured.duplicates, 'packet')} came twice, {measured.reordered} after one that was sent later."
+        )
     if measured.interval > 0.0:
         yield f"Outages shorter than {_ms(measured.interval)} between two packets were not seen."

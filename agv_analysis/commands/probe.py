@@ -9,6 +9,7 @@ import click
 
 from agv_analysis.commands import OUTPUT, with_force
 from agv_analysis.output_file import output_file
+from agv_ros.counted import counted
 
 
 @click.command("probe")
@@ -46,7 +47,7 @@ def command(
     try:
         if listen:
             answered, refused = link_probe.listen(port, peer=peer, seconds=seconds, ready=_say_ready)
-            click.echo(f"{answered} packets answered, {refused} refused")
+            click.echo(f"{counted(answered, 'packet')} answered, {refused} refused")
             return
         assert host is not None
         _measure(host, port, _interval(params, interval), duration, size, trace)
@@ -88,7 +89,7 @@ def _measure(host: str, port: int, interval: float, duration: float, size: int |
     up = sum(arrived is None for arrived in found.arrived)
     back = sum(returned is None for returned in found.returned)
     said = f"{up} lost on the way up, {back - up} on the way down" if found.is_listed else f"{back} without an answer"
-    click.echo(f"{count} packets, {said}")
+    click.echo(f"{counted(count, 'packet')}, {said}")
     for note in found.notes:
         click.echo(f"note: {note}")
     click.echo(f"trace: {trace}; see agv-ncs link {trace}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import OUTPUT, needs_ros, with_force, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from agv_analysis.run import Run
@@ -70,7 +71,8 @@ def command(
     if outages is not None:
         lost = write_outages(outages, run, link == "downlink")
         click.echo(
-            f"outages: {outages}: {lost} of {len(run)} slots lost, the first is step {run.k[0]} of the recording"
+            f"outages: {outages}: {lost} of {counted(len(run), 'slot')} lost, the first is step {run.k[0]} of the "
+            "recording"
         )
     scenario = with_settings(run.scenario, settings)
     if scenario.error_detector.track == PATH and (again or (on_dds and edge == "own")):
@@ -112,7 +114,10 @@ def _play(
         outcome, errors, commands = runner.replay_in_process(
             scenario, inputs, Pace(lockstep, rate), out, progress, starts_edge
         )
-    click.echo(f"{outcome.steps} slots played, {len(errors)} errors and {len(commands)} commands came back")
+    click.echo(
+        f"{counted(outcome.steps, 'slot')} played, {counted(len(errors), 'error')} and "
+        f"{counted(len(commands), 'command')} came back"
+    )
     if outcome.recording:
         click.echo(f"bag: {out}: {outcome.recording}")
     failures = [failure for failure in (outcome.failure, outcome.recording_failure) if failure]
@@ -160,7 +165,7 @@ def _on_dds(scenario: Scenario, bag: Path) -> Run:
 
 
 def _words(difference: Difference) -> str:
-    found = f"{difference.compared} steps compared, "
+    found = f"{counted(difference.compared, 'step')} compared, "
     if difference.first is None:
         return found + f"equal (largest difference {difference.largest:.1e})"
     return found + (

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from agv_analysis.commands import corridor_settings, needs_ros, with_settings, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from agv_analysis.runtime.fleet import Vehicle
@@ -110,7 +111,7 @@ def command(
             outcome = run_in_processes(scenario, bag, progress, on_disk=disk)
         else:
             outcome = run_in_process(scenario, bag, progress, on_disk=disk, is_watched=live)
-    click.echo(f"{outcome.steps} steps" + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
+    click.echo(counted(outcome.steps, "step") + (f", {outcome.rate:.0f} steps/s" if outcome.rate else ""))
     if outcome.recording:
         click.echo(f"bag: {bag}: {outcome.recording}")
     failures = dict.fromkeys(failure for failure in (outcome.failure, outcome.recording_failure) if failure)
@@ -155,7 +156,8 @@ def _run_fleet(
     ended = dict(zip(fleet, outcomes, strict=True))
     rate = sum(outcome.rate for outcome in outcomes)
     click.echo(
-        f"{count} AGVs, {sum(outcome.steps for outcome in outcomes)} steps" + (f", {rate:.0f} steps/s" * bool(rate))
+        f"{counted(count, 'AGV')}, {sum(outcome.steps for outcome in outcomes)} steps"
+        + (f", {rate:.0f} steps/s" * bool(rate))
     )
     vehicles = _judged(ended, bag)
     if bag is not None:
@@ -223,10 +225,10 @@ def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
     """What the fleet does, and which AGV is the reason, with rich's markup; nothing without recordings."""
     from agv_analysis.report.table import colour_of
     from agv_analysis.runtime.fleet import instability
-    from agv_analysis.sweep.verdicts import counted
+    from agv_analysis.sweep.verdicts import words_said
 
     if worst := _worst(vehicles):
-        words = counted([{"verdict": one.verdict} for one in vehicles])
+        words = words_said([{"verdict": one.verdict} for one in vehicles])
         yield "Verdict", f"[{colour_of(str(worst.verdict))}]{words}[/]"
     if strayed := [one for one in vehicles if one.deviation is not None]:
         farthest = max(strayed, key=_largest)
@@ -239,7 +241,7 @@ def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
         yield (
             "Unstable",
             (
-                f"{found.unstable} of {found.judged} AGVs, {found.fraction:.1%} "
+                f"{found.unstable} of {counted(found.judged, 'AGV')}, {found.fraction:.1%} "
                 f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
             ),
         )

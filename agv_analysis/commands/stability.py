@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from agv_analysis.commands import OUTPUT, corridor_settings, with_corridor, with_force, with_settings, write_json
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -181,7 +182,7 @@ def _told(twins: Twins, seeds: range) -> str:
     if twins.different == 1 < len(seeds):
         word = f"contracts to {twins.median:.2g}" if twins.contracting else "does not contract"
         return f"1 run, which {word}: the seeds {seeds[0]} to {seeds[-1]} all give the same"
-    runs = f"in {twins.contracting} of {len(seeds)} runs (seeds {seeds[0]} to {seeds[-1]})"
+    runs = f"in {twins.contracting} of {counted(len(seeds), 'run')} (seeds {seeds[0]} to {seeds[-1]})"
     converge = f"neighbouring trajectories converge {runs}"
     if not math.isfinite(twins.median):
         return f"{converge}; the others diverge"

@@ -12,6 +12,7 @@ import click
 
 from agv_analysis.commands import corridor_settings, with_corridor, with_force, with_report, with_settings
 from agv_analysis.sweep import CORRIDOR_COLUMNS, METRICS, MOST_POINTS
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -117,7 +118,8 @@ def command(
     if not complete:
         again = ": the same command with --resume goes on" if out is not None else ""
         click.echo(
-            f"interrupted after {sum(row['runs'] for row in rows)} of {sweep.size * seeds} runs{again}", err=True
+            f"interrupted after {sum(row['runs'] for row in rows)} of {counted(sweep.size * seeds, 'run')}{again}",
+            err=True,
         )
         raise click.exceptions.Exit(130)
 
@@ -163,7 +165,7 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
 
     from agv_analysis.report.table import metres, print_framed
-    from agv_analysis.sweep.verdicts import counted
+    from agv_analysis.sweep.verdicts import words_said
 
     names = ("unstable\nruns", "share of\nthem", "95 %\nconfidence", "steps to\n1 cm", "largest\ndeviation")
     table = _table(sweep, names)
@@ -179,13 +181,14 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     console.print(table)
     if rows and "verdict" in rows[0]:
         console.print(_verdicts(sweep, rows))
-        console.print(f"Verdicts: {counted(rows)}")
+        console.print(f"Verdicts: {words_said(rows)}")
     if rows and "p_lap" in rows[0]:
         console.print(_corridors(sweep, rows))
     unsaid = sum(row["undecided"] for row in rows)
     if unsaid:
         console.print(
-            f"[bold yellow]Undecided:[/] {unsaid} runs are shorter than the transient of the loop without losses, "
+            f"[bold yellow]Undecided:[/] {counted(unsaid, 'run is', 'runs are')} shorter than the transient of "
+            "the loop without losses, "
             "so neighbouring trajectories that are not closer by their end say nothing; make plant.duration longer."
         )
 
@@ -195,18 +198,20 @@ def _headlines(sweep: Sweep, rows: list[dict[str, Any]]) -> Iterator[tuple[str, 
     from rich.markup import escape
 
     from agv_analysis.report.table import metres
-    from agv_analysis.sweep.sweep_sentence import best_point, is_calm, sweep_sentence
+    from agv_analysis.sweep.sweep_sentence import best_point, is_calm, sweep_reason, sweep_sentence
 
     yield "Verdict", escape(sweep_sentence(rows, *sweep.axes))
+    if reason := sweep_reason(rows, *sweep.axes):
+        yield "Because", escape(reason)
     calm = [row for row in rows if is_calm(row)]
     if not calm:
         return
     best = best_point(rows)
     where = ", ".join(f"{axis.name} {_plain(best[axis.name])}" for axis in sweep.axes)
     largest = metres(best["deviation_max_p50"])
-    yield "Deviation", f"largest {largest} at {where}, the best point (median of the runs)"
+    yield "Deviation", f"largest {largest} at {where} (best point, median)"
     sure = 100.0 * max(row["instability_high"] for row in calm)
-    yield "Confidence", f"at the stable points below {sure:.3g} % of all runs unstable (95 %)"
+    yield "Confidence", f"below {sure:.3g} % of runs unstable at stable points (95 %)"
 
 
 _IN_A_LAP = "leaves in\na lap"

@@ -24,6 +24,7 @@ from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
+from agv_ros.counted import counted
 
 _PLACES = 500
 """Places of the lap, at least, at which it is asked behind a predictor which repeated outages let an error grow."""
@@ -110,7 +111,7 @@ class Corridor:
         if found.n < 0:
             return "none: the AGV is outside without any"
         where = f"({found.x:.3g}, {found.y:.3g}) m, {found.step * self.ts:.4g} s into the lap"
-        length = f"{found.n} slots ({found.n * self.ts * 1e3:g} ms)"
+        length = f"{counted(found.n, 'slot')} ({found.n * self.ts * 1e3:g} ms)"
         return f"{length}, which leads {found.deviation:.3g} m off at most; worst at {where}"
 
     def _any(self) -> str:
@@ -118,15 +119,16 @@ class Corridor:
             return f"no sequence found that leaves ({self.n_any_reason})"
         if self.n_any < 0:
             return "none: the AGV is outside without any"
-        return f"no sequence found that leaves up to {self.n_any} slots; {self.n_any_reason}"
+        return f"no sequence found that leaves up to {counted(self.n_any, 'slot')}; {self.n_any_reason}"
 
     def _proved(self) -> str:
-        if self.tube is None:
-            return f"no n ({self.tube_reason})" if self.n_any_proved is None else "not even without outages"
+        n = self.n_any_proved
+        if self.tube is None or n is None:
+            return f"no n ({self.tube_reason})" if n is None else "not even without outages"
         off = f"at most {self.tube.deviation:.3g} m off, by the linear loop"
         if self.covering is not None:
-            return f"{self.n_any_proved} slots: {off}, {self.covering.deviation:.3g} m with what is of second order"
-        return f"{self.n_any_proved} slots: {off}; what is of second order could not be covered"
+            return f"{counted(n, 'slot')}: {off}, {self.covering.deviation:.3g} m with what is of second order"
+        return f"{counted(n, 'slot')}: {off}; what is of second order could not be covered"
 
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
@@ -199,7 +201,7 @@ def corridor(
     progress("laps")
     # Noise and slip are not part of what is proved.
     covered = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else n_proved
-    found = leaving(loop, single, laps, lambda done: progress(f"{done} laps"), covered)
+    found = leaving(loop, single, laps, lambda done: progress(counted(done, "lap")), covered)
     progress("the RMS deviation")
     stationary, why_not = _stationary(loop)
     rms = rms_deviation(loop, chain_alone(scenario), stationary, why_not, found)
@@ -235,9 +237,13 @@ def _any_outages(loop: LapLoop, single: SingleOutage) -> tuple[int | None, Worst
     growing = _growing(loop, longest) or None
     n, sequence = largest_n(loop, longest if growing is None else min(longest, growing - 1))
     if growing is not None and n == growing - 1:
-        return n, sequence, f"with outages of {growing} slots, again and again, a small error does not die out"
+        return (
+            n,
+            sequence,
+            f"with outages of {counted(growing, 'slot')}, again and again, a small error does not die out",
+        )
     if single.n is None and n == longest:
-        return None, sequence, f"tried up to {longest} slots"
+        return None, sequence, f"tried up to {counted(longest, 'slot')}"
     if n == single.n:
         return n, sequence, "no more than of a single one"
     return n, sequence, f"outages of {_turns(sequence.lengths)} slots leave"

@@ -27,6 +27,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.stability.derived_loop import has_closed_form
 from agv_analysis.stability.margin_map import CURVATURE, SPEED, TS, MarginMap, axes_of, scenario_at
 from agv_analysis.stability.margin_map_points import LIMIT
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
 N_ANY, P_HOUR = "n_any", "p_hour"
@@ -91,7 +92,7 @@ def best_point(found: MarginMap) -> str:
     row, column = np.unravel_index(np.lexsort(tuple(key.ravel() for key in rank))[0], n_any.shape)
     where = f"{found.labels[0]} = {found.first[row]:.4g}, {found.labels[1]} = {found.second[column]:.4g}"
     n = int(n_any[row, column])
-    outages = "any outages" if n >= LIMIT else f"any outages of up to {n} slots"
+    outages = "any outages" if n >= LIMIT else f"any outages of up to {counted(n, 'slot')}"
     kept = f"best kept at {where}: in {outages}"
     if p_hour is None:
         return kept

@@ -35,6 +35,7 @@ from agv_analysis.simulation.trace_windows import parts_of_traces, with_windows
 from agv_plant.channels.registry import TRACE
 from agv_plant.parameters import ChannelParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
+from agv_ros.counted import counted
 
 LAPS = 200
 """Laps that are simulated, if they are of usual length."""
@@ -115,12 +116,12 @@ def leaving(
     chain = chain_alone(loop.scenario)
     if left < ENOUGH and chain is not None and single is not None and single.n is not None and single.n >= 0:
         longer = 1.0 if n_proved is None or n_proved < 0 or left else outages_of(chain, n_proved + 1)
-        if longer * HOUR / loop.ts < _NEVER:
-            method = f"how rarely an outage is longer than the {n_proved} slots with which it stays inside"
+        if n_proved is not None and longer * HOUR / loop.ts < _NEVER:
+            method = f"how rarely an outage is longer than the {counted(n_proved, 'slot')} with which it stays inside"
             return _of_rate(loop, Estimate(0.0, 0.0, longer), driven, method)
         rate = leaving_rate(loop, chain, single.n, loop.scenario.relay.seed)
         if 0.0 < rate.per_slot.value * loop.steps < _RARE:
-            return _of_rate(loop, rate.per_slot, driven, f"importance splitting with {rate.runs} runs")
+            return _of_rate(loop, rate.per_slot, driven, f"importance splitting with {counted(rate.runs, 'run')}")
     method = f"{laps} simulated laps, {left} of which left it"
     return _of_laps(loop, Estimate.of(left, laps), seconds / left if left else None, driven, method)
 

@@ -20,6 +20,7 @@ from agv_analysis.link.transitions import SAMPLES
 from agv_analysis.metrics.confidence import clopper_pearson
 from agv_analysis.metrics.outages import outage_begins, outage_lengths
 from agv_analysis.run import Floats, Run
+from agv_ros.counted import counted
 
 FEW = 10
 """Outages below which a tail is not to be trusted."""
@@ -52,7 +53,8 @@ class RecordedOutages:
     def rows(self) -> list[tuple[str, str]]:
         """Name and value of each figure, in plain text."""
         seen = (
-            f"{self.left} of {self.outages} outages led outside, at most {self.largest:.3g} of the half-width was used"
+            f"{self.left} of {counted(self.outages, 'outage')} led outside, at most {self.largest:.3g} of the "
+            "half-width was used"
         )
         found = [("Seen in the run", seen)]
         bound = f"with 95 % confidence at most {self.at_most:.3g} of all outages lead outside"

@@ -11,6 +11,7 @@ from agv_analysis.doctor import extras, machine, network
 from agv_analysis.doctor.timed_loop import TimedLoop, on_dds, on_timer
 from agv_analysis.runtime.shared_memory import Leftover, leftovers
 from agv_analysis.version import version
+from agv_ros.counted import counted
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def _notes(found: Examination) -> Iterator[str]:
     if left:
         mine = sum(one.mine for one in left)
         yield (
-            f"{len(left)} files of shared memory belong to no process that lives, {mine} of them yours: "
+            f"{counted(len(left), 'file')} of shared memory belong to no process that lives, {mine} of them yours: "
             "agv-ncs doctor --fix removes yours"
         )
     yield from _notes_on_loop(found.loop)
@@ -116,4 +117,7 @@ def _notes_on_loop(loop: TimedLoop | None) -> Iterator[str]:
     if loop.failure:
         yield f"{loop.what} failed: {loop.failure}"
     elif missed := loop.jitter["missed deadlines"]:
-        yield f"{missed:.0f} of {loop.steps} deadlines were missed: in real time this machine decides what comes out"
+        yield (
+            f"{missed:.0f} of {counted(loop.steps, 'deadline was', 'deadlines were')} missed: in real time this "
+            "machine decides what comes out"
+        )

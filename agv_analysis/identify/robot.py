@@ -24,6 +24,7 @@ from agv_analysis.recordings.posture_track import Track
 from agv_analysis.recordings.robot_commands import sent_commands
 from agv_analysis.recordings.robot_topics import RobotTopics
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S
 
@@ -145,7 +146,7 @@ def identify(
     usable = np.isfinite(commands).all(axis=1)
     instants, commands = instants[usable], commands[usable]
     if len(instants) < 2:
-        raise UserError(f"{source}: {len(instants)} commands with finite numbers; at least 2 are needed")
+        raise UserError(f"{source}: {counted(len(instants), 'command')} with finite numbers; at least 2 are needed")
     zero = int(instants[0])
     sent, seen = (instants - zero) / NS_PER_S, (poses.stamps - zero) / NS_PER_S
     period = float(np.median(np.diff(sent)))
@@ -153,7 +154,8 @@ def identify(
     covered = np.flatnonzero((seen >= LONGEST_DEAD_TIME) & (seen <= sent[-1] + period))
     if len(covered) < _LEAST_POSES:
         raise UserError(
-            f"{source}: {len(covered)} poses lie between {LONGEST_DEAD_TIME:g} s after the first command and the last "
+            f"{source}: {counted(len(covered), 'pose lies', 'poses lie')} between {LONGEST_DEAD_TIME:g} s after "
+            "the first command and the last "
             f"one; at least {_LEAST_POSES} are needed: do the commands' and the poses' clocks agree?"
         )
     rows = covered[:MOST_POSES]
@@ -168,9 +170,9 @@ def identify(
 
 def _notes(sent: Floats, period: float, covered: int, unusable: int) -> Iterator[str]:
     if unusable:
-        yield f"{unusable} commands are not finite, they are left out"
+        yield f"{counted(unusable, 'command is', 'commands are')} not finite, they are left out"
     if covered > MOST_POSES:
-        yield f"of {covered} poses the first {MOST_POSES} are used"
+        yield f"of {counted(covered, 'pose')} the first {MOST_POSES} are used"
     pause = float(np.diff(sent).max())
     if pause > max(0.5, 10.0 * period):
         yield f"no command came for {pause:.2f} s; the robot is taken to follow the last one meanwhile"

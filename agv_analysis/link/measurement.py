@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from agv_analysis.link.large_arrays import column_of, count_of, median_step, parts
 from agv_analysis.run import Floats
 from agv_plant.parameters import ChannelParameters
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
 RECEIVED, LOST, UNKNOWN, NOT_SENT = 0, 1, 2, 3
@@ -52,7 +53,7 @@ class Malformed:
         if not self.count:
             return ()
         more = f", and {self.count - len(self.shown)} more" if self.count > len(self.shown) else ""
-        lines = "1 line was" if self.count == 1 else f"{self.count} lines were"
+        lines = counted(self.count, "line was", "lines were")
         return (f"{lines} not understood and left out ({'; '.join(self.shown)}{more})",)
 
 

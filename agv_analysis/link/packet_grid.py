@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from agv_analysis.link.large_arrays import PART, Column, column_of, parts, release
 from agv_analysis.link.measurement import LOST, RECEIVED, Codes, MeasurementError
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 
 Ints = NDArray[np.int64]
 
@@ -156,7 +157,8 @@ class PacketGrid:
 def _check(first: int, last: int, records: int) -> None:
     if last - first + 1 > _SPARSE * records + _MOST_MISSING:
         raise NumbersError(
-            f"numbers go from {first} to {last}, and {records} packets have one: these are no sequence numbers, or one "
+            f"numbers go from {first} to {last}, and {counted(records, 'packet has', 'packets have')} one: these "
+            "are no sequence numbers, or one "
             "of them is broken"
         )
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from agv_analysis.recordings.messages_on_steps import NOTHING, OnSteps, Steps, stamps_of
 from agv_analysis.recordings.slot_outcomes import reasons
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 from agv_ros.messages import DELAYED, DELIVERED
 from agv_ros.stamps import NS_PER_S, Grid
@@ -78,7 +79,8 @@ def refuse_other_grid(on_steps: Mapping[str, OnSteps], stamps: Mapping[str, Step
         off, count = on_steps[topic].off_grid, len(stamps[topic])
         if off > count / 2:
             raise UserError(
-                f"{source}: {off} of {count} messages of {topic} are not on the grid of plant.start_time + k * "
+                f"{source}: {off} of {counted(count, 'message')} of {topic} are not on the grid of "
+                "plant.start_time + k * "
                 f"plant.ts = {grid.start_ns / NS_PER_S:g} s + k * {grid.ts_ns / NS_PER_S:g} s: name the params file of "
                 "this run with --config"
             )

@@ -31,6 +31,7 @@ from agv_analysis.recordings.receive_times import (
 )
 from agv_analysis.run import Run, Timing
 from agv_analysis.scenario import Scenario
+from agv_ros.counted import counted
 from agv_ros.stamps import NS_PER_S
 
 START_UP = 0.1
@@ -256,7 +257,8 @@ def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str
         yield "the plant's diagnostics are not in the recording: missed deadlines are not known"
     elif said.missed:
         yield (
-            f"{said.missed} of {said.steps} deadlines missed, the longest by {_ms(said.longest_overdue)}; the AGV held "
+            f"{said.missed} of {counted(said.steps, 'deadline')} missed, the longest by "
+            f"{_ms(said.longest_overdue)}; the AGV held "
             "its command"
         )
     if said is not None and said.stops:
@@ -267,7 +269,8 @@ def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str
         yield from late_sentences(run, timing)
         if said is not None and said.ignored > RARE * said.steps:
             yield (
-                f"the AGV ignored {said.ignored} commands, which came after a newer one or long before their instant"
+                f"the AGV ignored {counted(said.ignored, 'command')}, which came after a newer one or long before "
+                "their instant"
             )
 
 
@@ -275,13 +278,15 @@ def late_sentences(run: Run, timing: Timing) -> Iterator[str]:
     """How late poses and commands were; `run` has the ages by receive time of at least one of them."""
     if timing.late_poses and run.n_ul_received is not None:
         yield (
-            f"{timing.late_poses} poses came a sampling period or more too late: age by receive time at most "
+            f"{counted(timing.late_poses, 'pose')} came a sampling period or more too late: age by receive time "
+            "at most "
             f"{_steps(run, run.n_ul_received)}, by stamps {int(run.n_ul.max())}"
         )
     oldest = 0 if run.n_dl_received is None else int(run.n_dl_received.max())
     if run.n_dl_received is not None and oldest > (0 if run.n_dl is None else int(run.n_dl.max())):
         yield (
-            f"{timing.late_commands} commands came after the step that they were for had ended; the AGV acted on "
+            f"{counted(timing.late_commands, 'command')} came after the step that they were for had ended; the "
+            "AGV acted on "
             f"commands at most {_steps(run, run.n_dl_received)} old"
         )
     yield (
@@ -292,7 +297,7 @@ def late_sentences(run: Run, timing: Timing) -> Iterator[str]:
 
 def _steps(run: Run, age: NDArray[np.int64]) -> str:
     most = int(age.max())
-    return f"{most} steps ({most * run.ts:g} s)"
+    return f"{counted(most, 'step')} ({most * run.ts:g} s)"
 
 
 def _ms(duration: float) -> str:

@@ -9,6 +9,7 @@ from agv_analysis.bags.writer import METADATA_NAME, REPLAY_OF
 from agv_analysis.recordings.messages_on_steps import OnSteps
 from agv_analysis.run import Run
 from agv_analysis.stability.driven_commands import driven_commands, wrong_errors
+from agv_ros.counted import counted
 
 
 def of_replay(bag: Bag) -> Iterator[str]:
@@ -41,13 +42,25 @@ def of_messages(on_steps: Mapping[str, OnSteps], names: Mapping[str, str]) -> It
     """Messages that do not become part of the run, by topic."""
     for topic, messages in on_steps.items():
         if messages.off_grid:
-            yield f"{names[topic]}: {messages.off_grid} messages are no sampling instant's, they are left out"
+            yield (
+                f"{names[topic]}: {counted(messages.off_grid, 'message is', 'messages are')} no sampling "
+                "instant's, they are left out"
+            )
         if messages.far:
-            yield f"{names[topic]}: {messages.far} messages have stamps far from all others, they are left out"
+            yield (
+                f"{names[topic]}: {counted(messages.far, 'message has', 'messages have')} stamps far from all "
+                "others, they are left out"
+            )
         if messages.unusable:
-            yield f"{names[topic]}: {messages.unusable} messages with numbers that no node takes, they are left out"
+            yield (
+                f"{names[topic]}: {counted(messages.unusable, 'message')} with numbers that no node takes, they "
+                "are left out"
+            )
         if messages.repeated:
-            yield f"{names[topic]}: {messages.repeated} messages repeat a step, the first of each counts"
+            yield (
+                f"{names[topic]}: {counted(messages.repeated, 'message repeats', 'messages repeat')} a step, "
+                "the first of each counts"
+            )
 
 
 def of_mismatch(run: Run) -> Iterator[str]:

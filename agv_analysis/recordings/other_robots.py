@@ -28,6 +28,7 @@ from agv_analysis.scenario import Scenario, load_scenario, parse_scenario
 from agv_cloud.parameters import CSV
 from agv_cloud.reference.reference import Reference
 from agv_cloud.reference.track_file import load_track
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 from agv_ros.parameters import as_dict
 from agv_ros.stamps import NS_PER_S, to_nanoseconds
@@ -158,14 +159,18 @@ def _reference_notes(
         yield f"the track begins {where}, at the time of the first pose"
         if len(came.stamps) < len(poses.stamps):
             yield (
-                f"{topics.pose}: {len(poses.stamps) - len(came.stamps)} poses came after the end of the track file, "
+                f"{topics.pose}: {counted(len(poses.stamps) - len(came.stamps), 'pose')} came after the end of "
+                "the track file, "
                 "they are left out"
             )
         return
     yield from target.notes
     if len(came.stamps) < len(poses.stamps):
         left_out = len(poses.stamps) - len(came.stamps)
-        yield f"{topics.pose}: {left_out} poses lie before or after the reference, they are left out"
+        yield (
+            f"{topics.pose}: {counted(left_out, 'pose lies', 'poses lie')} before or after the reference, they "
+            "are left out"
+        )
     if poses.frame != target.frame:
         yield (
             f"{topics.pose} is in frame {poses.frame!r}, {topics.reference} in frame {target.frame!r}: no transform "

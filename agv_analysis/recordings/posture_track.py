@@ -12,6 +12,7 @@ from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.recordings.clock_steps import clock_steps
 from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 from agv_ros.messages import SQUARED_LENGTH, yaw_of_quaternion
 from agv_ros.stamps import NS_PER_S
@@ -104,11 +105,14 @@ def in_order(track: Track, where: str, topic: str) -> Track:
     """
     stamped = track.stamps != 0
     if not stamped.any():
-        raise UserError(f"{where}: all its {len(stamped)} stamps are 0, no time: their sender must set header.stamp")
+        raise UserError(
+            f"{where}: all its {counted(len(stamped), 'stamp is', 'stamps are')} 0, no time: their sender must "
+            "set header.stamp"
+        )
     finite = np.isfinite(track.x + track.y + track.theta + track.v + track.w)
     usable = track.chosen(finite & stamped)
     if not len(usable.stamps):
-        raise UserError(f"{where}: none of its {len(finite)} poses has finite numbers and an orientation")
+        raise UserError(f"{where}: none of its {counted(len(finite), 'pose')} has finite numbers and an orientation")
     for row, step in clock_steps(usable.stamps, usable.log_times):
         raise UserError(
             f"{where}: the clock of its stamps was set by {step / NS_PER_S:+.3f} s against the log times, after the "

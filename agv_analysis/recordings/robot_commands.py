@@ -11,6 +11,7 @@ from agv_analysis.recordings.clock_steps import other_clock
 from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.recordings.posture_track import Track, by_the_clock_of, messages_of
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 from agv_ros.stamps import NS_PER_S
 
@@ -39,7 +40,7 @@ def read_commands(
     known = newest >= 0
     command[known] = speeds[newest[known]]
     if held := int(np.count_nonzero(np.diff(newest[known]) == 0)):
-        notes = (*notes, f"{topic}: no command came in {held} of {len(stamps)} steps, the last one is held")
+        notes = (*notes, f"{topic}: no command came in {held} of {counted(len(stamps), 'step')}, the last one is held")
     return command, notes
 
 
@@ -55,7 +56,8 @@ def sent_commands(bag: Bag, topic: str, came: Track, wheelbase: float | None) ->
         instants = by_the_clock_of(came, messages[LOG_TIME])
     elif not instants.all():
         notes.append(
-            f"{topic}: {np.count_nonzero(instants == 0)} stamps are 0, which is no time, their messages are left out"
+            f"{topic}: {counted(int(np.count_nonzero(instants == 0)), 'stamp is', 'stamps are')} 0, which is no time, "
+            "their messages are left out"
         )
         messages, instants = messages[instants != 0], instants[instants != 0]
     if prefix and (ahead := clock_ahead(bag, topic, came)):

@@ -16,6 +16,7 @@ from agv_analysis.bags.layout import LOG_TIME
 from agv_analysis.recordings.messages_on_steps import Steps, stamps_of
 from agv_analysis.recordings.posture_track import Track, in_order, messages_of, with_speeds, yaws_of
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -60,7 +61,7 @@ def read_transforms(bag: Bag, topic: str, parent: str, child: str) -> Track:
         raise UserError(f"{bag.path}: {topic}: no instant at which all transforms from {parent} to {child} are known")
     ordered = in_order(track, f"{bag.path}: {topic}", topic)
     early = int(np.count_nonzero(~known))
-    note = f"{topic}: {early} transforms came before all of those from {parent} to {child} were known"
+    note = f"{topic}: {counted(early, 'transform')} came before all of those from {parent} to {child} were known"
     return with_speeds(ordered)._replace(notes=(*ordered.notes, note) if early else ordered.notes)
 
 

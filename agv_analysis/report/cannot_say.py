@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.verdict import UNDECIDED, UNKNOWN
+from agv_ros.counted import counted
 
 
 def cannot_say(analysis: Observations, within: CorridorOfRun | None = None) -> Iterator[str]:
@@ -19,7 +20,7 @@ def cannot_say(analysis: Observations, within: CorridorOfRun | None = None) -> I
     if run.source == "simulation":
         yield "How a real AGV on a real radio differs from this model: the run was simulated"
     elif longest:
-        yield f"What follows an outage of more than {longest} slots: none was seen"
+        yield f"What follows an outage of more than {counted(longest, 'slot')}: none was seen"
     if analysis.deviation.reason:
         yield f"How far it strays once its start is over: the deviation is {analysis.deviation.reason}"
     if run.timing is not None and run.timing.unknown:

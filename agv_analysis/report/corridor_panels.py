@@ -11,6 +11,7 @@ from agv_analysis.corridor.outer_tube import Tube
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.report.panels import DRIVEN, LIMIT, OTHER, Line, Panel
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 
 _MOST_PLACES = 2000
 """Places of a lap at which an edge is drawn: closer than a pixel on any screen."""
@@ -21,10 +22,10 @@ def corridor_panel(found: Corridor) -> Panel:
     seconds: Floats = np.arange(len(found.lap), dtype=np.float64) * found.ts
     lines = []
     if found.single is not None and found.single.n is not None and found.single.n >= 0:
-        name = f"after one outage of {found.single.n} slots that begins here"
+        name = f"after one outage of {counted(found.single.n, 'slot')} that begins here"
         lines.append(Line(name, seconds, found.single.shares * found.widths.half_width, DRIVEN))
     if found.tube is not None:
-        name = f"at most, under any outages of up to {found.tube.n} slots"
+        name = f"at most, under any outages of up to {counted(found.tube.n, 'slot')}"
         lines.append(Line(name, seconds, _of_lap(found.tube.distance, len(seconds)), OTHER))
     ends = seconds[[0, -1]]
     lines.append(Line("corridor", ends, np.full(2, found.widths.half_width), LIMIT))
@@ -43,7 +44,7 @@ def edges_along(lap: Floats, widths: Widths, tube: Tube | None, remark: str = ""
     name = "corridor" if tube is not None else f"corridor{remark}"
     lines = [_edge(name, lap[some], np.full(len(some), widths.half_width), LIMIT)]
     if tube is not None:
-        name = f"tube for any outages up to {tube.n} slots{remark}"
+        name = f"tube for any outages up to {counted(tube.n, 'slot')}{remark}"
         lines.append(_edge(name, lap[some], _of_lap(tube.distance, len(lap))[some], OTHER))
     return tuple(lines)
 

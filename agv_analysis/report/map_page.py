@@ -20,6 +20,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.stability.margin_map import TS, MarginMap, axes_of, map_columns
 from agv_analysis.sweep.picture import INSTABILITY_COLOURS
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
+from agv_ros.counted import counted
 
 _TICKS = (-1, 0, 1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)
 """Numbers of slots that a colour bar names."""
@@ -52,7 +53,7 @@ def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: st
         title="agv_ncs: map of margins",
         verdict=map_sentence(found, scenario),
         word="unknown",
-        at=f"{rows} by {columns} points about the scenario's own",
+        at=f"{rows} by {counted(columns, 'point')} about the scenario's own",
         sections=[{"key": name, "title": _capital(titles[name]), "height": 460} for name in found.margins],
         chosen=_nearest(found, scenario),
         columns=columns,
@@ -113,7 +114,7 @@ def _texts(found: MarginMap, name: str) -> list[list[str]]:
 
 def _said(name: str, value: float) -> str:
     outside = "outside" if name == N_ANY else "unstable"
-    return f"{outside} even without outages" if value < 0 else f"{value:g} slots"
+    return f"{outside} even without outages" if value < 0 else counted(value, "slot")
 
 
 def _capital(text: str) -> str:

@@ -15,6 +15,7 @@ from agv_analysis.metrics.error_metrics import body_errors, wrapped
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.run import Floats, Run
 from agv_analysis.stability.analysis import Analysis, Observations
+from agv_ros.counted import counted
 
 TIME = "time [s]"
 
@@ -281,7 +282,10 @@ def unit_circle(analysis: Analysis) -> Panel:
         Line("paper's A(k)", eigenvalues.real, eigenvalues.imag, DRIVEN, MARKERS),
         *_deciding({"lifted system": multipliers, "paper's A(k)": eigenvalues}),
     )
-    title = f"Eigenvalues: the paper's along the run, the lifted system's for a pose always {analysis.n} steps old"
+    title = (
+        "Eigenvalues: the paper's along the run, the lifted system's for a pose always "
+        f"{counted(analysis.n, 'step')} old"
+    )
     return Panel("eigenvalues", title, "Re", "Im", lines, equal=True)
 
 

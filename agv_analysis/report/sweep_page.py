@@ -21,8 +21,9 @@ from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.picture import INSTABILITY_COLOURS, across_and_up, border_colour, can_draw, draw
 from agv_analysis.sweep.plan import Axis, Sweep, varied
-from agv_analysis.sweep.sweep_sentence import Rows, best_point, is_calm, sweep_sentence
-from agv_analysis.sweep.verdicts import counted
+from agv_analysis.sweep.sweep_sentence import Rows, best_point, is_calm, sweep_reason, sweep_sentence
+from agv_analysis.sweep.verdicts import words_said
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
 _MOST_ROWS = 500
@@ -50,7 +51,8 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
         more={"laps": laps},
         data={
             "sentence": sweep_sentence(rows, *sweep.axes),
-            "words": counted(rows),
+            "words": words_said(rows),
+            "reason": sweep_reason(rows, *sweep.axes),
             "axes": [axis.name for axis in (across_and_up(sweep) if len(sweep.axes) == 2 else sweep.axes)],
             "points": plain,
             "commands": [_command_of(sweep, row) for row in rows],
@@ -60,7 +62,9 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
         title="agv_ncs: sweep",
         verdict=sweep_sentence(rows, *sweep.axes),
         word="unknown",
-        words=counted(rows),
+        words=words_said(rows),
+        why=_why(rows),
+        reason=sweep_reason(rows, *sweep.axes),
         tiles=list(_tiles(sweep, rows)),
         sections=[{"key": key, "title": "Probability of instability", "height": 520} for key in drawn],
         axes=[(axis.name, axis_words(axis, sweep.base)) for axis in sweep.axes],
@@ -77,6 +81,14 @@ def write_sweep_report(sweep: Sweep, rows: Rows, path: Path, command: str) -> No
     write_page(html, path)
 
 
+def _why(rows: Rows) -> str:
+    """What the page's reason is one for."""
+    calm = sum(map(is_calm, rows))
+    if calm in (0, len(rows)):
+        return "Why" if calm else "Why none is"
+    return f"Why the other {counted(len(rows) - calm, 'point is', 'points are')} not"
+
+
 def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
     """What is asked first of a sweep."""
     if not rows:
@@ -85,7 +97,7 @@ def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
     yield Tile(
         "stable",
         "Stable",
-        f"{len(calm)} of {len(rows)} points",
+        f"{len(calm)} of {counted(len(rows), 'point')}",
         "in all runs" + " and by the verdict" * ("verdict" in rows[0]),
     )
     if calm:
@@ -93,7 +105,7 @@ def _tiles(sweep: Sweep, rows: Rows) -> Iterator[Tile]:
         where = ", ".join(f"{axis.name} {number(best[axis.name])}" for axis in sweep.axes)
         yield Tile("deviation", "Smallest worst deviation", metres(best["deviation_max_p50"]), f"at {where} (median)")
         sure = max(row["instability_high"] for row in calm)
-        said = f"by {calm[0]['runs']} runs at each point, with 95 % confidence"
+        said = f"by {counted(calm[0]['runs'], 'run')} at each point, with 95 % confidence"
         yield Tile("sure", "How sure", f"below {100.0 * sure:.3g} % unstable", said)
 
 

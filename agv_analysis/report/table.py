@@ -18,6 +18,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.margins import margins
 from agv_analysis.stability.verdict import BOUNDED, GREEN, UNDECIDED, UNKNOWN
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,9 +42,8 @@ def print_table(analysis: Observations) -> None:
 
     console = Console(highlight=False)
     for topic, count in analysis.run.unexplained.items():
-        console.print(
-            f"[bold red]Invalid:[/] {count} messages of {escape(topic)} are missing, and no channel lost them."
-        )
+        what = "it" if count == 1 else "them"
+        console.print(f"[bold red]Invalid:[/] {_missing(escape(topic), count)}, and no channel lost {what}.")
     print_framed(console, headline_rows(analysis))
     print_groups(console, grouped_rows(analysis))
     for sentence in _disagreements(analysis):
@@ -130,7 +130,7 @@ def print_side_by_side(analyses: Mapping[str, Observations]) -> None:
         table.add_row(f"[bold]{name}[/]", *(figures.get(name, "-") for figures in found))
     for title, analysis in analyses.items():
         for topic, count in analysis.run.unexplained.items():
-            console.print(f"[bold red]{title} is invalid:[/] {count} messages of {escape(topic)} are missing.")
+            console.print(f"[bold red]{title} is invalid:[/] {_missing(escape(topic), count)}.")
     console.print(table)
     for title, analysis in analyses.items():
         for sentence in (*_disagreements(analysis), *analysis.run.notes):
@@ -164,7 +164,7 @@ def _deviation_in_short(found: Deviation) -> str:
     if not found.worst:
         return metres(found.largest) if found.is_diverged else f"{at_most(found.largest)}, RMS {metres(found.rms)}"
     worst = found.worst[0]
-    after = "" if worst.outage is None else f", after an outage of {worst.outage.slots} slots"
+    after = "" if worst.outage is None else f", after an outage of {counted(worst.outage.slots, 'slot')}"
     return f"{at_most(worst.distance)}, at {worst.seconds:g} s{after}"
 
 
@@ -188,14 +188,20 @@ def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     run, up = analysis.run, analysis.outages.uplink
     ms = 1e3 * run.ts
     seed = f", seed {run.scenario.relay.seed}" if run.seed_known else ""
-    yield "Run", f"{len(run)} steps of {ms:g} ms{seed}"
-    yield "Uplink", f"{100.0 * up.loss_rate:.3g} % lost, in {up.count} outages of {up.mean_burst:.1f} slots on average"
+    yield "Run", f"{counted(len(run), 'step')} of {ms:g} ms{seed}"
+    yield (
+        "Uplink",
+        f"{100.0 * up.loss_rate:.3g} % lost, in {counted(up.count, 'outage')} of {up.mean_burst:.1f} slots on average",
+    )
     if len(causes := loss_causes(run.uplink)) > 1:
         yield "Lost by", ", ".join(f"{cause} ({count})" for cause, count in causes.items())
-    yield "Longest outage", f"{up.longest} slots ({up.longest * ms:g} ms)"
+    yield "Longest outage", f"{counted(up.longest, 'slot')} ({up.longest * ms:g} ms)"
     yield (
         "Age of information",
-        (f"n_ul: mean {up.age.mean:.2f}, p99 {up.age.p99}, at most {up.age.max} steps ({up.age.max * ms:g} ms)"),
+        (
+            f"n_ul: mean {up.age.mean:.2f}, p99 {up.age.p99}, at most {counted(up.age.max, 'step')} "
+            f"({up.age.max * ms:g} ms)"
+        ),
     )
     acted = analysis.outages.command_age
     if acted is not None:
@@ -208,9 +214,15 @@ def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     if down.lost or down.age.max:
         yield (
             "Downlink",
-            f"{100.0 * down.loss_rate:.3g} % lost, command at most {down.age.max} steps ({down.age.max * ms:g} ms) old",
+            f"{100.0 * down.loss_rate:.3g} % lost, command at most {counted(down.age.max, 'step')} "
+            f"({down.age.max * ms:g} ms) old",
         )
     yield "Fitted channel", _fit(analysis)
+
+
+def _missing(topic: str, count: int) -> str:
+    """How many messages of a topic are not there."""
+    return f"{counted(count, 'message')} of {topic} {'is' if count == 1 else 'are'} missing"
 
 
 def _disagreements(analysis: Observations) -> list[str]:
@@ -224,7 +236,11 @@ def convergence_rows(found: Convergence, ms: float) -> Iterator[tuple[str, str]]
 
     first = found.initial
     bands = {"1 cm": first.settle_1cm_steps, "2 %": first.settle_2pct_steps}
-    seen = [f"{steps} steps ({steps * ms / 1e3:g} s) to {band}" for band, steps in bands.items() if steps is not None]
+    seen = [
+        f"{counted(steps, 'step')} ({steps * ms / 1e3:g} s) to {band}"
+        for band, steps in bands.items()
+        if steps is not None
+    ]
     seen += [f"not to {band}" for band, steps in bands.items() if steps is None and seen]
     yield "Settling", "; ".join(filter(None, (", ".join(seen), escape(first.reason))))
     yield (
@@ -256,7 +272,7 @@ def deviation_sizes(found: Deviation) -> str:
 
 
 def _peak(peak: Peak) -> str:
-    cause = "no outage" if peak.outage is None else f"{peak.outage.link} outage of {peak.outage.slots} slots"
+    cause = "no outage" if peak.outage is None else f"{peak.outage.link} outage of {counted(peak.outage.slots, 'slot')}"
     return f"{metres(peak.distance)} at {peak.seconds:g} s ({cause})"
 
 
@@ -275,7 +291,7 @@ def _excursion(found: LastExcursion | None) -> str:
         return "none"
     cause = "of the initial error" if found.is_initial_error else "not after an outage"
     if found.after is not None:
-        cause = f"after an outage of {found.after} slots"
+        cause = f"after an outage of {counted(found.after, 'slot')}"
     when = f"{found.seconds:g} s" if found.is_over else f"lasts when the run ends, at {found.seconds:g} s"
     return f"{when}, {cause}"
 

@@ -12,6 +12,7 @@ from agv_analysis.metrics.confidence import percent_after_of
 from agv_analysis.report.table import metres
 from agv_analysis.stability.analysis import Analysis, Observations
 from agv_analysis.stability.verdict import GREEN, SURE
+from agv_ros.counted import counted
 
 
 class Tile(NamedTuple):
@@ -30,12 +31,12 @@ def tiles(analysis: Observations, within: CorridorOfRun | None = None) -> Iterat
     worst = next(iter(deviation.worst), None)
     when = "" if worst is None else f"at {worst.seconds:g} s"
     if worst is not None and worst.outage is not None:
-        when += f", after an outage of {worst.outage.slots} slots"
+        when += f", after an outage of {counted(worst.outage.slots, 'slot')}"
     yield Tile("deviation", "Worst deviation", metres(deviation.largest), when or deviation.reason)
     yield Tile("corridor", "Corridor", *_corridor(within))
-    outages = f"{up.count} outages, {up.mean_burst:.3g} slots on average" if up.count else "no outage"
+    outages = f"{counted(up.count, 'outage')}, {counted(up.mean_burst, 'slot')} on average" if up.count else "no outage"
     yield Tile("losses", "Lost updates", f"{100.0 * up.loss_rate:.3g} %", outages)
-    longest = f"{up.longest} slots ({up.longest * run.ts * 1e3:g} ms)"
+    longest = f"{counted(up.longest, 'slot')} ({up.longest * run.ts * 1e3:g} ms)"
     yield Tile("outage", "Longest outage", longest, _guaranteed(analysis))
     if np.isfinite(deviation.speed):
         asked = f"asked for at most, turning at {deviation.turn_rate:.3g} rad/s"
@@ -70,7 +71,7 @@ def _corridor(within: CorridorOfRun | None) -> tuple[str, str]:
         return "none given", "--corridor D asks for it"
     seen, width = within.seen, f"{within.widths.half_width:g} m"
     if seen.left:
-        return width, f"left after {seen.left} of {seen.outages} outages"
+        return width, f"left after {seen.left} of {counted(seen.outages, 'outage')}"
     if not seen.largest <= 1.0:
         return width, "left"
     return width, f"kept: at most {100.0 * seen.largest:.0f} % of it was used"
@@ -86,7 +87,7 @@ def _guaranteed(analysis: Observations) -> str:
             return "guaranteed limit: none, any length is survived"
         if evidence.n_bursts < 0:
             return "guaranteed limit: not known"
-        return f"guaranteed limit: {'at least ' if evidence.is_least else ''}{evidence.n_bursts} slots"
+        return f"guaranteed limit: {'at least ' if evidence.is_least else ''}{counted(evidence.n_bursts, 'slot')}"
     bursts = analysis.judgements.get("bursts")
     if bursts is None:
         return "guaranteed limit: not known"

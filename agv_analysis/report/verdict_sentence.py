@@ -15,6 +15,7 @@ from agv_analysis.stability.verdict import (
     UNDECIDED,
     UNKNOWN,
 )
+from agv_ros.counted import counted
 
 
 def sentence(analysis: Observations) -> str:
@@ -60,7 +61,7 @@ def in_short(analysis: Observations) -> str:
     if word == ASYMPTOTIC and n == 0:
         return "stable; no update was lost"
     if word == ASYMPTOTIC and _is_late(analysis):
-        return f"stable with poses {n} steps old"
+        return f"stable with poses {counted(n, 'step')} old"
     if word == MEAN_SQUARE and n_bursts is not None and n > n_bursts:
         return f"stable in mean square; not guaranteed for the longest outage seen ({n})"
     return in_words(word, n)
@@ -69,7 +70,7 @@ def in_short(analysis: Observations) -> str:
 def in_words(word: str, n: int) -> str:
     """A verdict's word in half a line, of a loop whose longest outage is `n` slots."""
     return {
-        ASYMPTOTIC: f"stable under any outages of up to {n} slots" if n else "stable without losses",
+        ASYMPTOTIC: f"stable under any outages of up to {counted(n, 'slot')}" if n else "stable without losses",
         MEAN_SQUARE: "stable in mean square",
         BOUNDED: "bounded; only the speed limit bounds the error",
         UNDECIDED: "undecided; too little was seen of the link",
@@ -120,7 +121,7 @@ def _met(analysis: Observations) -> str:
     oldest = _oldest(analysis)
     age = f"{oldest * analysis.run.ts * 1e3:g} ms"
     if _is_late(analysis):
-        return f"poses up to {oldest} steps ({age}) old"
+        return f"poses up to {counted(oldest, 'step')} ({age}) old"
     if analysis.run.downlink_lost.any():
         return "losses on both links, of poses and of commands,"
     return f"outages of {analysis.n} lost updates in a row ({age})"

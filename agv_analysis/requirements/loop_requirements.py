@@ -27,6 +27,7 @@ from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import loop_on_lap
 from agv_plant.parameters import ChannelParameters
+from agv_ros.counted import counted
 
 LOSS_RATES = (0.001, 0.01, 0.05, 0.1, 0.3, 0.5)
 """At which the curve of bursts is computed."""
@@ -164,11 +165,15 @@ def _survival(loop: LinearLoop, reasons: dict[str, str]) -> int | None:
     longest = longest_for(loop)
     slots, refuted = joint_spectral_radius.largest_n(loop, longest)
     if slots is None:
-        reasons["survival_time_s"] = f"no bound: every outage that was tried is survived, up to {longest} slots"
+        reasons["survival_time_s"] = (
+            f"no bound: every outage that was tried is survived, up to {counted(longest, 'slot')}"
+        )
     elif slots < 0:
         reasons["survival_time_s"] = "the error does not contract even without outages"
     elif refuted is not None and refuted > slots + 1:
-        reasons["survival_time_s"] = f"proved up to {slots} slots, refuted from {refuted} on, between them undecided"
+        reasons["survival_time_s"] = (
+            f"proved up to {counted(slots, 'slot')}, refuted from {refuted} on, between them undecided"
+        )
     return slots
 
 

@@ -28,6 +28,7 @@ from agv_analysis.stability.gains import best_for_bursts, best_in_mean_square
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of, loop_on_lap
 from agv_plant.radio.delay import whole_slots
+from agv_ros.counted import counted
 from agv_ros.parameters import ParameterError
 
 _FASTEST = 50.0
@@ -189,23 +190,23 @@ def _holds(loop: LinearLoop, offered: OfferedService) -> _Answer:
     channel = offered.channel(loop.ts)
     square = None if channel.chain is None else _dies_out(loop, channel.chain)
     if slots and not loop.is_exact and not floquet.is_stable_with_delay(loop, slots):
-        return _Answer(False, f"a pose that is always {slots} slots late makes the error grow", square)
+        return _Answer(False, f"a pose that is always {counted(slots, 'slot')} late makes the error grow", square)
     found = joint_spectral_radius.verdict(loop, n)
     growth = math.log(found.lower) / loop.ts if found.lower > 0.0 else -math.inf
     if found.verdict == joint_spectral_radius.UNSTABLE:
-        length = "1 slot" if found.worst == 1 else f"{found.worst} slots"
+        length = counted(found.worst, "slot")
         what = f"outages of {length}, again and again, make the error grow"
         return _Answer(
             False, what if found.worst else "the error does not contract even without outages", square, growth
         )
     if found.verdict != joint_spectral_radius.STABLE:
-        return _Answer(False, f"that any outages of up to {n} slots die out is not proved", square, growth)
+        return _Answer(False, f"that any outages of up to {counted(n, 'slot')} die out is not proved", square, growth)
     if square is False:
         why = f"its failures, as of {channel.why}, make the mean square of the error grow"
         return _Answer(False, why, square, growth)
-    late = f", or a delay of {slots} slots" if slots else ""
+    late = f", or a delay of {counted(slots, 'slot')}" if slots else ""
     often = "" if square is None else ", and the mean square of the error with the failures"
-    return _Answer(True, f"any sequence of outages of up to {n} slots dies out{late}{often}", square, growth)
+    return _Answer(True, f"any sequence of outages of up to {counted(n, 'slot')} dies out{late}{often}", square, growth)
 
 
 def _dies_out(loop: LinearLoop, chain: Chain) -> bool:

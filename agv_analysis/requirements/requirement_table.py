@@ -11,6 +11,7 @@ from agv_analysis.requirements.link_availability import LinkAvailability
 from agv_analysis.requirements.loop_requirements import LoopRequirements
 from agv_analysis.requirements.offered_service import OnService
 from agv_analysis.requirements.service_classes import ServiceClass
+from agv_ros.counted import counted
 
 Row = tuple[str, str]
 
@@ -47,7 +48,7 @@ def rows_of_loop(found: LoopRequirements) -> Iterator[Row]:
 def _slots(slots: int | None, ts: float) -> str:
     if slots is None:
         return "all that were tried"
-    return "none: the AGV is outside without any" if slots < 0 else f"{_ms(slots * ts)} ({slots} slots)"
+    return "none: the AGV is outside without any" if slots < 0 else f"{_ms(slots * ts)} ({counted(slots, 'slot')})"
 
 
 def _said(text: str | None, reasons: Mapping[str, str], name: str) -> str:
@@ -69,8 +70,8 @@ def rows_of_link(found: LinkAvailability) -> Iterator[Row]:
     yield "Unavailability", _estimate(found.unavailability)
     yield "Mean time between failures", _estimate(found.mtbf, " s")
     yield "Loss rate", _estimate(found.loss_rate)
-    if found.failures is not None:
-        yield "Failures seen", f"{found.failures} in {found.packets} packets"
+    if found.failures is not None and found.packets is not None:
+        yield "Failures seen", f"{found.failures} in {counted(found.packets, 'packet')}"
     yield "Assumed", found.assumption
 
 
@@ -98,7 +99,7 @@ def _share(found: Estimate) -> str:
 def rows_of_service(found: OnService) -> Iterator[Row]:
     """What the loop does on an offered service."""
     offered, channel = found.offered, found.channel
-    yield "Outages while it is available", f"up to {_ms(offered.survival_time)} ({found.slots} slots)"
+    yield "Outages while it is available", f"up to {_ms(offered.survival_time)} ({counted(found.slots, 'slot')})"
     if channel.failure is not None:
         yield (
             "A failure lasts, on average",

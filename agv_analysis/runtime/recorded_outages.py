@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from agv_analysis.output_file import output_file
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
 
@@ -23,7 +24,11 @@ def write_outages(path: Path, run: Run, downlink: bool = False) -> int:
     topic, lost = ("agv/slot", run.downlink_lost) if downlink else ("edge/slot", run.lost)
     gaps = int(run.k[-1] - run.k[0]) + 1 - len(run) + run.unexplained.get(topic, 0)
     if gaps:
-        raise UserError(f"{run.source}: {gaps} slots of {topic} are missing, so it is not known whether they were lost")
+        raise UserError(
+            f"{run.source}: {counted(gaps, f'slot of {topic} is', f'slots of {topic} are')} missing, "
+            "so it is not known "
+            "whether they were lost"
+        )
     try:
         _write(path, lost)
     except OSError as error:

@@ -22,6 +22,7 @@ from agv_plant.downlink_policy import DOWNLINK_POLICIES
 from agv_plant.parameters import PlantParameters
 from agv_plant.vehicle.motion import NOISE, SLIP, vehicle_parameters
 from agv_plant.vehicle.registry import UNICYCLE, VEHICLES
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 from agv_ros.parts import PartError
 from agv_ros.pose import Pose
@@ -140,7 +141,10 @@ def _notes(scenario: Scenario, done: int, steps: int, command: Floats) -> list[s
     notes = []
     refused = np.flatnonzero(np.isinf(command).any(axis=1))
     if len(refused):
-        notes.append(f"{len(refused)} commands were not finite and were refused, the first at step {refused[0]}")
+        notes.append(
+            f"{counted(len(refused), 'command was', 'commands were')} not finite and were refused, the first at "
+            f"step {refused[0]}"
+        )
     if done < steps:
         notes.append(f"the loop diverged: after step {done - 1} of {steps} the AGV's pose is no longer finite")
     if scenario.plant.clock != "lockstep":

@@ -17,6 +17,7 @@ from agv_analysis.stability.criteria.paper_test import PaperTest
 from agv_analysis.stability.evidence import Judgements, evidence_of_run, verdict_of_run
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
 from agv_analysis.stability.verdict import Evidence, Verdict
+from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
 GAINS_UNKNOWN = "the controller's gains are not known: name its params file with --config"
@@ -158,25 +159,28 @@ class Analysis(Observations):
             return found
         if paper is not None and paper.stable and not self.lifted_stable:
             found.append(
-                f"the paper's test calls the loop stable, but a pose that is always {self.n} steps old makes the "
+                f"the paper's test calls the loop stable, but a pose that is always {counted(self.n, 'step')} old "
+                "makes the "
                 f"error grow by a factor {self.lifted_radius:.4f} a step: the test takes the outdated pose for the "
                 "current one"
             )
         bursts = self.bursts
         if paper is not None and paper.stable and bursts is not None and bursts.verdict == UNSTABLE:
             found.append(
-                f"the paper's test calls the loop stable, but outages of {bursts.worst} slots in a row, again and "
+                f"the paper's test calls the loop stable, but outages of {counted(bursts.worst, 'slot')} in a "
+                "row, again and "
                 f"again, make the error grow by a factor {bursts.lower:.4f} a step"
             )
         if paper is not None and not paper.stable and self.bursts_stable:
             found.append(
                 f"the paper's test calls the loop unstable (|lambda| = {paper.radius:.6g} at step "
-                f"{paper.k}), but it contracts under any outages of up to {self.n} slots"
+                f"{paper.k}), but it contracts under any outages of up to {counted(self.n, 'slot')}"
             )
         if self.bursts_stable and not self.lifted_stable:
             found.append(
-                f"outages of up to {self.n} slots are survived, since a fresh pose follows each; a pose that is always "
-                f"{self.n} steps old is not"
+                f"outages of up to {counted(self.n, 'slot')} are survived, since a fresh pose follows each; a "
+                "pose that is always "
+                f"{counted(self.n, 'step')} old is not"
             )
         return found
 

@@ -33,6 +33,7 @@ from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.parameters import PATH
 from agv_cloud.staleness.estimate import is_stepwise
 from agv_cloud.staleness.registry import number_of
+from agv_ros.counted import counted
 from agv_ros.parts import PartError
 
 _MOST_PIECES = 4
@@ -307,11 +308,15 @@ def _sentence(run: Run, k: NDArray[np.int64], wrong: NDArray[np.bool_], pieces: 
         return f"commands differ from the control law with these parameters from {at(first)} on: {said}"
     count, total = int(np.count_nonzero(wrong)), len(wrong)
     if CONTROL_LAWS.find(law).memory:
-        return f"{count} of {total} commands are not those of {law} with these parameters, the first at {at(first)}"
+        return (
+            f"{count} of {counted(total, 'command is', 'commands are')} not those of {law} with these "
+            f"parameters, the first at {at(first)}"
+        )
     after = wrong[np.argmax(wrong) :]
     if after.mean() < _FEW:
         return (
-            f"{count} of {total} commands are not those of the control law, the first at {at(first)}: did anything "
+            f"{count} of {counted(total, 'command is', 'commands are')} not those of the control law, the first "
+            f"at {at(first)}: did anything "
             "else publish commands?"
         )
     return (

@@ -30,6 +30,7 @@ from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.repeated_run import RepeatedRun, is_disturbed, repeated_run
 from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE, SURE, UNSTABLE, Evidence, Verdict, decide, weakest
 from agv_cloud.reference.reference import lap_steps
+from agv_ros.counted import counted
 
 _TIMES_AS_FAR = 2.0
 """A recorded deviation may be this many times the simulated one, for what the model of the plant does not know."""
@@ -331,7 +332,10 @@ def _contradictions(run: Run, driven: DrivenCommands, repeated: RepeatedRun | No
     if driven.differs:
         yield driven.sentence
     if timing is not None and timing.unknown and timing.missed_deadlines:
-        yield f"{timing.missed_deadlines} deadlines were missed, and how old the commands were by then is not known"
+        yield (
+            f"{counted(timing.missed_deadlines, 'deadline was', 'deadlines were')} missed, and how old the "
+            "commands were by then is not known"
+        )
     if repeated is None:
         yield "steps are missing from the recording, so that the loop cannot be simulated under its losses"
         return

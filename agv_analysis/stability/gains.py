@@ -26,6 +26,7 @@ from agv_analysis.stability.almost_sure import mean_log
 from agv_analysis.stability.criteria.criterion import growth_text
 from agv_analysis.stability.joint_spectral_radius import largest_n_along
 from agv_analysis.stability.mean_square import along_spectral_radius
+from agv_ros.counted import counted
 
 TOLERANCE = 0.1
 """Relative tolerance of a gain that is meant to be best almost surely."""
@@ -142,7 +143,9 @@ def best_kx(chain: Chain, advance: float, slots: int) -> dict[str, GainChoice]:
 
     best = {
         "no_outages": choice(1.0, "deadbeat"),
-        "delay": choice(best_for_delay(mean), f"each pose {mean} steps old") if mean else GainChoice(None, nothing),
+        "delay": choice(best_for_delay(mean), f"each pose {counted(mean, 'step')} old")
+        if mean
+        else GainChoice(None, nothing),
         "bursts": GainChoice(None, nothing),
         "mean_square": choice(best_in_mean_square(chain)[0]),
         "almost_sure": choice(best_almost_surely(chain)[0], WHY_A_TOLERANCE),
@@ -150,7 +153,10 @@ def best_kx(chain: Chain, advance: float, slots: int) -> dict[str, GainChoice]:
     if longest is None:
         best["bursts"] = GainChoice(None, "no answer: outages of the scenario's uplink may last over a million slots")
     elif longest > 0:
-        reason = f"for outages of up to {longest} slots; longer ones come in less than 5 % of runs of {slots} slots"
+        reason = (
+            f"for outages of up to {counted(longest, 'slot')}; longer ones come in less than 5 % of runs of "
+            f"{counted(slots, 'slot')}"
+        )
         best["bursts"] = choice(best_for_bursts(longest)[0], reason)
     return best
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from agv_analysis.run import Floats
 from agv_analysis.stability.linearisation import command_matrices, plant_matrices
 from agv_cloud.parameters import ControllerParameters
+from agv_ros.counted import counted
 
 MARGINAL = -1e-13
 """Growth per step (logarithm) that counts as none: round-off is 1e-16, and an error that stays is not stable."""
@@ -78,7 +79,9 @@ class LinearLoop:
         """Check the shapes. Raises ValueError."""
         rows, m, q = len(self.A), self.A.shape[-1], self.D.shape[-1]
         if rows not in (1, len(self.v_r)) or len(self.w_r) != len(self.v_r):
-            raise ValueError(f"matrices must have 1 row or one for each of {len(self.v_r)} steps, got {rows}")
+            raise ValueError(
+                f"matrices must have 1 row or one for each of {counted(len(self.v_r), 'step')}, got {rows}"
+            )
         if (self.P_h is None) != (self.P_u is None):
             raise ValueError("P_h and P_u belong together: the policy's model of the plant has both or neither")
         wanted = {

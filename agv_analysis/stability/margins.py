@@ -12,6 +12,7 @@ from agv_analysis.stability.criteria.criterion import Criterion, Margin, Scenari
 from agv_analysis.stability.empirical import Twins
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_plant.parameters import ChannelParameters, PlantParameters
+from agv_ros.counted import counted
 from agv_ros.parameters import as_dict
 
 GROWTH = ".mean_square_growth"
@@ -134,7 +135,10 @@ class Margins:
         guaranteed = (
             ""
             if self.n_bursts is None or self.n_bursts < 1
-            else f"; if the link guarantees outages of at most {self.n_bursts} slots, the loss rate does not matter"
+            else (
+                f"; if the link guarantees outages of at most {counted(self.n_bursts, 'slot')}, the loss rate "
+                "does not matter"
+            )
         )
         return f"the mean square, independent losses below {square:.4g}{beyond}{guaranteed}"
 
@@ -150,12 +154,13 @@ class Margins:
         if self.n_paper is not None and self.n_bursts is not None and self.n_paper < self.n_bursts:
             found.append(
                 "the paper's test calls the loop unstable "
-                + ("even without outages" if self.n_paper < 0 else f"beyond {self.n_paper} outages")
-                + f"; it contracts under any outages of up to {self.n_bursts} slots"
+                + ("even without outages" if self.n_paper < 0 else f"beyond {counted(self.n_paper, 'outage')}")
+                + f"; it contracts under any outages of up to {counted(self.n_bursts, 'slot')}"
             )
         if self.n_lifted is not None and self.n_bursts is not None and self.n_bursts > self.n_lifted:
             found.append(
-                f"outages of up to {self.n_bursts} slots are survived, since a fresh pose follows each; a pose that is "
+                f"outages of up to {counted(self.n_bursts, 'slot')} are survived, since a fresh pose follows "
+                "each; a pose that is "
                 f"always {_steps(self.n_lifted + 1)} old is not"
             )
         p_square, p_sure = self.p_mean_square, self.p_almost_sure
@@ -218,7 +223,7 @@ class Margins:
 
 
 def _steps(n: int) -> str:
-    return "1 step" if n == 1 else f"{n} steps"
+    return counted(n, "step")
 
 
 def margins(scenario: Scenario) -> Margins:

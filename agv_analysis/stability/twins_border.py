@@ -15,6 +15,7 @@ from agv_analysis.simulation import simulate_batch
 from agv_analysis.stability.criteria.criterion import Margin
 from agv_analysis.stability.empirical import LONG_ENOUGH, left_without_losses, too_short
 from agv_analysis.stability.repeated_run import settles_without_losses
+from agv_ros.counted import counted
 
 NAME, LABEL = "p_max.twins", "Independent losses, most simulated runs converge"
 
@@ -57,11 +58,15 @@ def twins_border(scenario: Scenario, seeds: int = SEEDS, progress: Callable[[int
         return Margin(NAME, LABEL, None, reason=f"no answer: {too_short(left)}")
     above = next((p for p in _GRID if not contract(p)), None)
     if above is None:
-        return Margin(NAME, LABEL, None, reason=f"no bound: most of {seeds} runs contract at every p up to {_GRID[-1]}")
+        return Margin(
+            NAME, LABEL, None, reason=f"no bound: most of {counted(seeds, 'run')} contract at every p up to {_GRID[-1]}"
+        )
     if above == 0.0:
         return Margin(NAME, LABEL, None, reason="not met: simulated runs do not converge even without losses")
     below = _GRID[_GRID.index(above) - 1]
     while above - below > _NARROWED:
         middle = 0.5 * (below + above)
         below, above = (middle, above) if contract(middle) else (below, middle)
-    return Margin(NAME, LABEL, below, f"below {below:.3f}, by {seeds} runs at each of {done} loss probabilities")
+    return Margin(
+        NAME, LABEL, below, f"below {below:.3f}, by {counted(seeds, 'run')} at each of {done} loss probabilities"
+    )

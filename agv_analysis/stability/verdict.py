@@ -31,6 +31,7 @@ from agv_analysis.metrics.deviation import DIVERGED
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence
 from agv_analysis.stability.driven_commands import DrivenCommands
 from agv_analysis.stability.repeated_run import RepeatedRun
+from agv_ros.counted import counted
 
 ASYMPTOTIC, MEAN_SQUARE, BOUNDED, UNSTABLE = "asymptotic", "mean-square", "bounded", "unstable"
 UNDECIDED = "undecided"
@@ -145,7 +146,10 @@ class Evidence:
 def decide(evidence: Evidence) -> Verdict:
     """The word on a loop."""
     if evidence.missing:
-        reason = f"{evidence.missing} messages are missing from the recording that no channel lost: it proves nothing"
+        reason = (
+            f"{counted(evidence.missing, 'message is', 'messages are')} missing from the recording that no "
+            "channel lost: it proves nothing"
+        )
         return Verdict(UNKNOWN, "recording", f"unknown: {reason}", reason)
     if evidence.infeasible:
         return Verdict(INFEASIBLE, "nominal_motion", f"none: {evidence.infeasible}", evidence.infeasible)
@@ -177,7 +181,7 @@ def weakest(verdicts: Sequence[Verdict]) -> Verdict:
 def _by_criteria(evidence: Evidence) -> Verdict:
     """The word by the linear criteria and by how much was seen of the link."""
     if evidence.late_by is not None:
-        return _late(evidence)
+        return _late(evidence, evidence.late_by)
     if evidence.growth is None and evidence.goes_on >= SURE and evidence.repeated is not None:
         return _repeating(evidence)
     if evidence.growth is None:
@@ -190,7 +194,7 @@ def _by_criteria(evidence: Evidence) -> Verdict:
     if evidence.growth >= 0.0:
         return _not_stable(evidence, evidence.growth_of, _grows(evidence))
     if evidence.growth_of == "mean_square" and is_survived and not evidence.is_unlimited:
-        reason = f"any sequence of outages of up to {evidence.n} slots is survived"
+        reason = f"any sequence of outages of up to {counted(evidence.n, 'slot')} is survived"
         if evidence.n == 0:
             reason = "no update was lost, and the error dies out"
         sure = f"; {_of_link(evidence)}" if evidence.link is not None else ""
@@ -217,8 +221,8 @@ def _mean_square(evidence: Evidence) -> Verdict:
     return Verdict(MEAN_SQUARE, evidence.growth_of, margin, reason)
 
 
-def _late(evidence: Evidence) -> Verdict:
-    age = f"each pose is {evidence.late_by} steps old when its command acts"
+def _late(evidence: Evidence, steps: int) -> Verdict:
+    age = f"each pose is {counted(steps, 'step')} old when its command acts"
     if evidence.lifted_radius < 1.0 and evidence.probability_stable < SURE:
         return _undecided(evidence)
     if evidence.lifted_radius < 1.0:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 from agv_analysis.stability.verdict import GREEN, MEAN_SQUARE
 from agv_analysis.sweep.plan import Axis
+from agv_ros.counted import counted
 
 Rows = list[dict[str, Any]]
 
@@ -20,12 +22,59 @@ def sweep_sentence(rows: Rows, *axes: Axis) -> str:
     sense = "in all runs and by the verdict" if "verdict" in rows[0] else "in all runs"
     bad = sum(row["unstable"] == row["runs"] for row in rows)
     if calm == len(rows):
-        return f"The loop is stable {sense} at all {len(rows)} points."
-    too_short = f"; at {short} runs are too short to say" if short else ""
+        return f"The loop is stable {sense} at {_all(len(rows))}."
+    too_short = f"; at {counted(short, 'point')} runs are too short to say" if short else ""
     where = _where(axes[0].name, rows) if calm and len(axes) == 1 else ""
     if where:
-        return f"Stable {sense} for {where} ({calm} of {len(rows)} points){too_short}."
-    return f"Of {len(rows)} points the loop is stable {sense} at {calm}, and in no run at {bad}{too_short}."
+        return f"Stable {sense} for {where} ({calm} of {counted(len(rows), 'point')}){too_short}."
+    nowhere = f", and in no run at {bad}" if bad else ""
+    return f"Of {counted(len(rows), 'point')} the loop is stable {sense} at {calm}{nowhere}{too_short}."
+
+
+def _all(points: int) -> str:
+    return {1: "the only point", 2: "both points"}.get(points, f"all {points} points")
+
+
+def sweep_reason(rows: Rows, *axes: Axis) -> str:
+    """Why the points that are not stable are so, or all are stable: the reason that most of them share; empty for none.
+
+    Reasons that differ in their numbers alone are one; then they are those of the first point that has it, which is
+    named.
+    """
+    asked = [row for row in rows if not is_calm(row)] or rows
+    if not asked:
+        return ""
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for row in asked:
+        kinds.setdefault(_NUMBERS.sub("#", reason_of(row)), []).append(row)
+    found = max(kinds.values(), key=len)
+    what = "points" if is_calm(asked[0]) else "points that are not stable"
+    where = f"at {len(found)} of the {len(asked)} {what}" if len(found) < len(asked) else ""
+    reason = reason_of(found[0])
+    if len({reason_of(row) for row in found}) > 1:
+        first = ", ".join(f"{axis.name} {_plain(found[0][axis.name])}" for axis in axes)
+        where += f"{', ' if where else ''}as at {first}"
+    return f"{where}{': ' if where else ''}{reason}"
+
+
+def reason_of(row: dict[str, Any]) -> str:
+    """Why a point counts as stable or not: what its verdict says, or without one its runs."""
+    if not row["settles_without_losses"]:
+        said = "the loop does not settle even without losses"
+    elif row["unstable"]:
+        said = "neighbouring trajectories that meet the same losses do not come closer in the simulated runs"
+    elif row.get("undecided"):
+        said = "the runs are too short to say"
+    else:
+        said = "neighbouring trajectories that meet the same losses come closer in every run"
+    return str(row.get("verdict_reason") or said)
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+_NUMBERS = re.compile(r"\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def is_calm(row: dict[str, Any]) -> bool:

@@ -49,7 +49,7 @@ def _with_verdict(sweep: Sweep, row: dict[str, Any]) -> dict[str, Any]:
     return {**varied_values, "verdict": verdict.word, "verdict_reason": verdict.reason, **row}
 
 
-def counted(rows: Rows) -> str:
+def words_said(rows: Rows) -> str:
     """How often each word was said, the best first: `3 asymptotic, 1 infeasible`; empty without verdicts."""
     count = Counter(row.get("verdict") for row in rows)
     return ", ".join(f"{count[word]} {word}" for word in WORDS if count[word])

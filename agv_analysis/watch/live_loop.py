@@ -6,13 +6,11 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 
-import numpy as np
-
 from agv_analysis.metrics.bands import TOLERANCE
-from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
+from agv_analysis.watch.largest_of_last import LargestOfLast
 from agv_analysis.watch.message_log import Heard
-from agv_analysis.watch.step_ring import StepRing, column
+from agv_analysis.watch.step_ring import COLUMNS, StepRing
 from agv_cloud.parameters import PATH
 from agv_cloud.reference.reference import Reference
 from agv_ros.codec import decode_command, decode_error, decode_slot, pose_decoder
@@ -36,6 +34,9 @@ POINTS = ("time", "x", "y", "deviation", "speed", "age", "lost", "commands_lost"
 """A point: time since step 0 [s] of its last step, and where the AGV was then [m]; the largest deviation [m], the last
 speed [m/s] and the largest age [s] in it; slots of up- and downlink that were lost in it."""
 
+LOOK_BACK = 60.0
+"""Time [s] of the loop over which the largest deviation is said."""
+
 _MOST_STEPS = 2_000_000
 """Steps that are kept at most, in 180 MB."""
 
@@ -44,6 +45,7 @@ FAR = 60.0
 may be missed."""
 
 _DEVIATION = POINTS.index("deviation")
+_X, _X_E, _AGE = (COLUMNS.index(name) for name in ("x", "x_e", "age"))
 
 _RECENT = 20
 """Steps in which the newest value is looked for."""
@@ -72,10 +74,11 @@ class LiveLoop:
         self._on: dict[int, Callable[[bytes], None]] = {
             TOPICS.index("edge/slot"): self._on_slot,
             TOPICS.index("agv/pose"): lambda data: self._on_pose(*decode(data)),
-            TOPICS.index("edge/error"): self._on_error,
             command: self._on_command,
             TOPICS.index("agv/slot"): self._on_command_slot,
         }
+        if self._reference is None:
+            self._on[TOPICS.index("edge/error")] = self._on_error
         self.restarts = 0
         self._clear()
 
@@ -97,6 +100,9 @@ class LiveLoop:
         """Its time [s]."""
         self.points_before = 0
         """Points that are kept no longer."""
+        self._largest = LargestOfLast(max(1, round(LOOK_BACK / (self.steps_per_point * self.ts))))
+        self._recent: list[list[float]] | None = None
+        """Rows of the last steps; None: messages have come since they were looked up."""
         self._last_slot = self._last_command_slot = -1
         self._next_point = -1
         self._newest_ns = 0
@@ -111,6 +117,7 @@ class LiveLoop:
 
     def take(self, messages: Iterable[Heard]) -> None:
         """Take in messages in the order of their topics and, of one topic, of time."""
+        self._recent = None
         for topic, data, _ in messages:
             act = self._on.get(topic)
             if act is not None:
@@ -176,19 +183,18 @@ class LiveLoop:
 
     # -- what is drawn and said ----------------------------------------------------------------------------------------
 
-    def deviations(self, begin: int, end: int) -> Floats:
-        """Distance of the AGV's poses from the reference [m] at the steps begin .. end - 1, shape (end - begin,).
+    def _deviation(self, k: int, row: list[float]) -> float:
+        """Distance of the AGV's pose from the reference [m] at step k, of which `row` is known; NaN if it is not known.
 
         On a planner's path, or of a robot with a clock of its own, the reference of a step is not known here: there it
         is the tracking error where the edge had a fresh pose, and NaN elsewhere.
         """
-        rows = self.ring.rows(begin, end)
         if self._reference is None:
-            size = np.hypot(column(rows, "x_e"), column(rows, "y_e"))
-            return np.where(column(rows, "age") == 0.0, size, math.nan)
-        points = np.array([self._reference[k][:2] for k in range(begin, end)]).reshape(-1, 2)
-        found: Floats = np.hypot(column(rows, "x") - points[:, 0], column(rows, "y") - points[:, 1])
-        return found
+            return math.hypot(row[_X_E], row[_X_E + 1]) if row[_AGE] == 0.0 else math.nan
+        if math.isnan(row[_X]):
+            return math.nan
+        reference = self._reference[k]
+        return math.hypot(row[_X] - reference.x, row[_X + 1] - reference.y)
 
     def make_points(self, is_over: bool = False) -> None:
         """Append the points whose steps are complete; of a loop that is over all but a part of one."""
@@ -199,6 +205,8 @@ class LiveLoop:
             self.points.append(self._point(begin, begin + self.steps_per_point))
             if self.settled < 0 and self.points[-1][_DEVIATION] < TOLERANCE:
                 self.settled, self.settled_at = self.points_before + len(self.points) - 1, self.points[-1][0]
+            if self.settled >= 0:
+                self._largest.add(self.points[-1][_DEVIATION])
             self._next_point += 1
         surplus = len(self.points) - self.most_points
         if surplus > 0:
@@ -214,22 +222,38 @@ class LiveLoop:
         return is_over or answered or seen >= end + _MOST_BEHIND * self.steps_per_point
 
     def _point(self, begin: int, end: int) -> list[float]:
-        rows = self.ring.rows(begin, end)
-        x, y, v = (_last(column(rows, name)) for name in ("x", "y", "v"))
-        age = _largest(column(rows, "age")) * self.ts
-        lost, commands = (float(np.nansum(column(rows, name))) for name in ("lost", "command_lost"))
-        return [(end - 1) * self.ts, x, y, _largest(self.deviations(begin, end)), v, age, lost, commands]
+        rows = self.ring.rows(begin, end).tolist()  # of some ten rows lists are faster than arrays
+        deviation = max(_known([self._deviation(k, row) for k, row in enumerate(rows, begin)]), default=math.nan)
+        of = {name: _known(values) for name, *values in zip(COLUMNS, *rows, strict=True)}
+        x, y, v = (of[name][-1] if of[name] else math.nan for name in ("x", "y", "v"))
+        age = max(of["age"], default=math.nan) * self.ts
+        return [(end - 1) * self.ts, x, y, deviation, v, age, sum(of["lost"]), sum(of["command_lost"])]
+
+    def recent_deviation(self) -> float:
+        """The largest deviation [m] of the points of the last LOOK_BACK seconds; NaN if none is known.
+
+        Only of points from the first one on at which it was below 1 cm, as a report takes it: before, it is the initial
+        error.
+        """
+        return self._largest.value
 
     def latest(self, name: str) -> float:
         """The newest value that is known of a column; NaN if there is none in the last steps."""
-        return _last(column(self.ring.rows(max(0, self.k - _RECENT), self.k + 1), name))
+        place = COLUMNS.index(name)
+        return next((row[place] for row in reversed(self._recent_rows()) if not math.isnan(row[place])), math.nan)
 
     def latest_deviation(self) -> tuple[int, float]:
         """The newest step whose deviation is known, and it [m]; -1 and NaN if there is none in the last steps."""
-        begin = max(0, self.k - _RECENT)
-        found = self.deviations(begin, self.k + 1)
-        known = np.flatnonzero(~np.isnan(found))
-        return (begin + int(known[-1]), float(found[known[-1]])) if len(known) else (-1, math.nan)
+        for back, row in enumerate(reversed(self._recent_rows())):
+            if not math.isnan(found := self._deviation(self.k - back, row)):
+                return self.k - back, found
+        return -1, math.nan
+
+    def _recent_rows(self) -> list[list[float]]:
+        """What is known of the last steps up to `k`, looked up once after each take: a page asks for several values."""
+        if self._recent is None:
+            self._recent = self.ring.rows(max(0, self.k - _RECENT), self.k + 1).tolist()
+        return self._recent
 
     def not_covered(self) -> str:
         """Why the links are none of which the margin knows; empty if they are."""
@@ -242,11 +266,5 @@ class LiveLoop:
         return ""
 
 
-def _last(values: Floats) -> float:
-    known = values[~np.isnan(values)]
-    return float(known[-1]) if len(known) else math.nan
-
-
-def _largest(values: Floats) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.max()) if len(known) else math.nan
+def _known(values: list[float]) -> list[float]:
+    return [value for value in values if not math.isnan(value)]

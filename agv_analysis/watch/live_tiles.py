@@ -10,10 +10,8 @@ from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.metrics.confidence import percent
 from agv_analysis.metrics.deviation import DIVERGED
 from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin
-from agv_analysis.watch.live_loop import POINTS, LiveLoop
-
-LOOK_BACK = 60.0
-"""Time [s] of the loop over which the largest deviation is said."""
+from agv_analysis.watch.live_loop import LOOK_BACK, LiveLoop
+from agv_ros.counted import counted
 
 _MOST_MISSED = 0.01
 """Share of missed deadlines above which losses alone do not say how old commands were."""
@@ -33,38 +31,28 @@ class LiveTile(NamedTuple):
 
 def live_tiles(loop: LiveLoop, margin: LinkMargin | None, deadlines: dict[str, str]) -> list[LiveTile]:
     """The figures of a loop now."""
-    largest = recent_deviation(loop)
+    largest = loop.recent_deviation()
     return [
         _verdict(margin, deadlines), _deviation(loop, largest), _corridor(loop, largest), _losses(loop),
         _outage(loop, margin), _age(loop), _speed(loop), _deadlines(loop, deadlines),
     ]  # fmt: skip
 
 
-def recent_deviation(loop: LiveLoop) -> float:
-    """The largest deviation [m] of the points of the last LOOK_BACK seconds; NaN if none is known.
-
-    Only of points after one at which it was below 1 cm, as a report takes it: before, it is the initial error.
-    """
-    if loop.settled < 0:
-        return math.nan
-    count = max(1, round(LOOK_BACK / (loop.steps_per_point * loop.ts)))
-    place, begin = POINTS.index("deviation"), max(len(loop.points) - count, loop.settled - loop.points_before, 0)
-    known = [point[place] for point in loop.points[begin:] if not math.isnan(point[place])]
-    return max(known, default=math.nan)
-
-
 def _verdict(margin: LinkMargin | None, deadlines: dict[str, str]) -> LiveTile:
     label = "Loop on this link"
     missed, steps = int(deadlines.get("missed deadlines", "0")), int(deadlines.get("step", "0"))
     if margin is not None and margin.word == STABLE and missed > _MOST_MISSED * steps:
-        why = f"{missed} of {steps} deadlines were missed: commands acted later than the losses say"
+        why = (
+            f"{missed} of {counted(steps, 'deadline was', 'deadlines were')} missed: commands acted later than "
+            "the losses say"
+        )
         return LiveTile("word", label, NOT_COVERED, why, FAIR)
     if margin is None:
         return LiveTile("word", label, "…", "computing")
     if margin.probability_stable is None:
         return LiveTile("word", label, margin.word, margin.reason, BAD if margin.word == UNSTABLE else FAIR)
     mood = {STABLE: GOOD, UNSTABLE: BAD}.get(margin.word, FAIR)
-    sure = f"in mean square, {percent(margin.probability_stable)} probable ({margin.slots} slots)"
+    sure = f"in mean square, {percent(margin.probability_stable)} probable ({counted(margin.slots, 'slot')})"
     return LiveTile("word", label, margin.word, sure if margin.word == STABLE else f"stable {sure}", mood)
 
 
@@ -115,19 +103,19 @@ def _corridor(loop: LiveLoop, largest: float) -> LiveTile:
 def _losses(loop: LiveLoop) -> LiveTile:
     if not loop.slots:
         return LiveTile("losses", "Lost updates", "none seen", "")
-    skipped = f"; {loop.skipped} slots not seen by this page" if loop.skipped else ""
-    commands = f"; {loop.commands_lost} of {loop.command_slots} commands" if loop.commands_lost else ""
+    skipped = f"; {counted(loop.skipped, 'slot')} not seen by this page" if loop.skipped else ""
+    commands = f"; {loop.commands_lost} of {counted(loop.command_slots, 'command')}" if loop.commands_lost else ""
     note = f"{loop.lost} of {loop.slots} since {loop.first * loop.ts:g} s{commands}{skipped}"
     return LiveTile("losses", "Lost updates", f"{100.0 * loop.lost / loop.slots:.2f} %", note)
 
 
 def _outage(loop: LiveLoop, margin: LinkMargin | None) -> LiveTile:
     longest = loop.longest_outage
-    value, mood = f"{longest} slots ({longest * loop.ts * 1e3:g} ms)", ""
+    value, mood = f"{counted(longest, 'slot')} ({longest * loop.ts * 1e3:g} ms)", ""
     note = "guaranteed limit: not known"
     if margin is not None and margin.guaranteed is not None and margin.guaranteed >= 0:
         mood = GOOD if longest <= margin.guaranteed else FAIR
-        note = f"guaranteed limit: {margin.guaranteed:g} slots"
+        note = f"guaranteed limit: {counted(margin.guaranteed, 'slot')}"
         if math.isinf(margin.guaranteed):
             note = "any length is survived"
     return LiveTile("outage", "Longest outage", value, note, mood)

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from agv_analysis.explore.background_criteria import LatestOnlyWorker, WorkerDiedError
 from agv_analysis.scenario import Scenario
@@ -16,12 +16,13 @@ from agv_analysis.watch.controls import controls_of
 from agv_analysis.watch.foxglove_server import Send
 from agv_analysis.watch.link_margin import LinkMargin, link_margin
 from agv_analysis.watch.live_loop import DIAGNOSTICS, MINUTES, LiveLoop
-from agv_analysis.watch.live_tiles import live_tiles
+from agv_analysis.watch.live_tiles import LiveTile, live_tiles
 from agv_analysis.watch.message_log import MessageLog
 from agv_analysis.watch.outage_order import with_outage
 from agv_analysis.watch.saved_bag import save_bag
 from agv_cloud.parameters import PATH
 from agv_cloud.reference.reference import Reference, lap_steps
+from agv_ros.counted import counted
 from agv_ros.messages import CHANGED
 from agv_ros.parameters import ParameterError, as_dict
 
@@ -32,11 +33,17 @@ if TYPE_CHECKING:
 TICK = 0.05
 """Time [s] between two frames."""
 
+_FIGURES = 4
+"""Frames between two looks at the figures: no reader takes in more than five a second."""
+
 _LEAD = 0.4
 """An outage that is asked for begins at least this much later [s], when the relay should know of it."""
 
 _LEAST_REST, _SHARE = 5.0, 9.0
 """Between two margins pass so many seconds and so many times what the last one took: a tenth of a core at most."""
+
+_MORE = 0.2
+"""A margin is computed anew once it lacks such a share of the slots or of the losses that it was computed from."""
 
 _QUIET = 1.0
 """After so long [s] without a slot the page says that nothing comes."""
@@ -45,6 +52,33 @@ _ASK_AGAIN = 0.25
 
 _FAREWELL = 1.0
 """How long [s] the end waits for pages that have not taken the last frame."""
+
+
+class Edition(NamedTuple):
+    """How often what a page shows, but for its points, has changed; each is -1 before its first frame."""
+
+    run: int = -1
+    parameters: int = -1
+    figures: int = -1
+
+
+class _Evidence(NamedTuple):
+    """What a margin is computed from."""
+
+    setting: tuple[object, ...]
+    """The run, its parameters, why they are not covered, and the longest outage: each of them changes the margin."""
+    slots: int
+    lost: int
+    """Since the loop began."""
+    window: float
+    """The most slots that are kept."""
+
+    def is_news_after(self, before: _Evidence | None) -> bool:
+        """Is it so much more than what the last margin was computed from?"""
+        if before is None or self.setting != before.setting:
+            return True
+        more = 1.0 + _MORE * min(1.0, before.window / max(before.slots, 1))
+        return self.slots > more * before.slots or self.lost > more * before.lost
 
 
 class WatchSession:
@@ -63,13 +97,16 @@ class WatchSession:
         self.loop: LiveLoop | None = None
         self.changed = threading.Condition()
         self.frames = 0
-        self.is_closed = False
+        self._ended = threading.Event()
         self.viewers = 0
         self.margin: LinkMargin | None = None
         self._begun_with: Scenario | None = None
         self._runs = self._edition = 0
         """How often the loop has begun anew, and its parameters have been others."""
         self._deadlines: dict[str, str] = {}
+        self._figures: list[LiveTile] = []
+        self._figures_at, self._figures_of = 0, (-1, False)
+        """The frame for which they were looked up; its run, and had the session ended?"""
         self._changes: dict[tuple[str, str], str] = {}
         self._is_stale = scenario is None
         """Are the nodes to be asked for their parameters?"""
@@ -84,10 +121,15 @@ class WatchSession:
         for thread in self._threads:
             thread.start()
 
+    @property
+    def is_closed(self) -> bool:
+        """Has the session ended?"""
+        return self._ended.is_set()
+
     def end(self) -> None:
         """Let the pages have what came last, and their connections end."""
         with self.changed:
-            self.is_closed = True
+            self._ended.set()
             self.changed.notify_all()
             self.changed.wait_for(lambda: self.viewers == 0, _FAREWELL)
 
@@ -163,8 +205,7 @@ class WatchSession:
                 else:
                     is_asked = True
                     self._adopt(found)
-            with self.changed:
-                self.changed.wait_for(lambda: self.is_closed, _ASK_AGAIN)
+            self._ended.wait(_ASK_AGAIN)
 
     _refusal = ""
 
@@ -184,47 +225,56 @@ class WatchSession:
 
     def _keep_margin(self) -> None:
         """Body of a thread: compute the margin again and again, in a process of its own."""
-        rest, is_first = _LEAST_REST, True
-        while True:
+        rest, is_first, before = _LEAST_REST, True, None
+        while not self._ended.wait(rest):
+            rest = _LEAST_REST
             with self.changed:
-                self.changed.wait_for(lambda: self.is_closed, rest)
-                loop, rest = self.loop, _LEAST_REST
-                if self.is_closed:
-                    return
-                if loop is None or loop.k < 0 or loop.scenario.error_detector.track == PATH:
+                loop, now = self.loop, self._evidence()
+                if loop is None or now is None or not now.is_news_after(before):
                     continue
                 k, lost = loop.ring.seen("lost", loop.k + 1)
-                asked = loop.scenario.to_yaml(), k, lost > 0.0, loop.not_covered()
-            begin = time.monotonic()
+                scenario, not_covered = loop.scenario, loop.not_covered()
+            begin, before = time.monotonic(), now
             try:
-                found = self._compute(*asked)
+                found = self._compute(scenario.to_yaml(), k, lost > 0.0, not_covered)
             except WorkerDiedError as error:
-                found = LinkMargin("Not computed", str(error))
+                found, before = LinkMargin("Not computed", str(error)), None
             if found is not None and self.loop is loop:
                 self.margin = found
             if not is_first:  # which has to start the other process
                 rest = max(_LEAST_REST, _SHARE * (time.monotonic() - begin))
             is_first = False
 
+    def _evidence(self) -> _Evidence | None:
+        """What a margin would be computed from now; None: there is none to compute."""
+        loop = self.loop
+        if loop is None or loop.k < 0 or loop.scenario.error_detector.track == PATH:
+            return None
+        setting = self._runs, self._edition, loop.not_covered(), loop.longest_outage
+        return _Evidence(setting, loop.slots, loop.lost, 60.0 * MINUTES / loop.ts)
+
     # -- what the page gets --------------------------------------------------------------------------------------------
 
-    def frame(self, since: int, edition: tuple[int, int]) -> tuple[str, int, tuple[int, int]]:
+    def frame(self, since: int, edition: Edition) -> tuple[str, int, Edition]:
         """A frame with the points from number `since` on, as JSON, the number of the next one, and the edition.
 
-        If the edition is not that which the page has, the parameters are told as well, and of another run all points.
+        What has changed since the edition that the page has is in it as well: parameters, figures, of another run all
+        points.
         """
         loop = self.loop
         content: dict[str, Any] = {"state": self._state()}
         if loop is None:
             return json.dumps(content), 0, edition
-        now = self._runs, self._edition
-        if edition != now:
+        self._look_at_figures(loop)
+        now = Edition(self._runs, self._edition, self._figures_at)
+        if edition[:2] != now[:2]:
             content["setup"] = self._setup(loop)
-            content["anew"] = edition[0] != now[0]
+            content["anew"] = edition.run != now.run
             since = 0 if content["anew"] else since
+        if edition != now:
+            content["tiles"] = self._figures
         first = max(0, since - loop.points_before)
         content["points"] = [[_rounded(value) for value in point] for point in loop.points[first:]]
-        content["tiles"] = live_tiles(loop, self.margin, self._deadlines)
         k, deviation = loop.latest_deviation()
         content["now"] = {
             "k": loop.k, "first": loop.first, "slots": loop.slots, "skipped": loop.skipped, "lost": loop.lost,
@@ -232,6 +282,12 @@ class WatchSession:
             "settled": loop.settled_at, "x": _rounded(loop.latest("x")), "y": _rounded(loop.latest("y")),
         }  # fmt: skip
         return json.dumps(content), loop.points_before + len(loop.points), now
+
+    def _look_at_figures(self, loop: LiveLoop) -> None:
+        of_run = self._runs, self.is_closed
+        if of_run != self._figures_of or self.frames >= self._figures_at + _FIGURES:
+            self._figures = live_tiles(loop, self.margin, self._deadlines)
+            self._figures_of, self._figures_at = of_run, self.frames
 
     def _state(self) -> str:
         if self._is_over:
@@ -302,7 +358,7 @@ class WatchSession:
         begun = self._begun_with or self._known().scenario
         names, types = self.watcher.names(), self.watcher.types()
         count = save_bag(path, self.log, names, types, begun, self._remote.names())
-        return f"{path}: {count} messages"
+        return f"{path}: {counted(count, 'message')}"
 
     def _known(self) -> LiveLoop:
         if self.loop is None:

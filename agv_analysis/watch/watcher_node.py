@@ -81,10 +81,13 @@ class WatcherNode:
     def look(self) -> None:
         """Listen to another type where the loop offers one, as the odometry of a robot. To be called now and then."""
         for i, (_, topic, node) in enumerate(self._topics):
-            for kind in _KINDS.get(topic, ()):
-                name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-                infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-                if kind is not self._heard[i].msg_type and any(info.topic_type == name for info in infos):
+            others = [kind for kind in _KINDS.get(topic, ()) if kind is not self._heard[i].msg_type]
+            if not others:
+                continue
+            infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+            offered = {info.topic_type for info in infos}
+            for kind in others:
+                if f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}" in offered:
                     node.destroy_subscription(self._heard[i])
                     self._heard[i] = self._listen(node, kind, topic)
                     break

@@ -27,6 +27,7 @@ from agv_analysis.link.measurement import (
 )
 from agv_analysis.link.packet_grid import PacketGrid
 from agv_analysis.recordings.sampling import period_of
+from agv_ros.counted import counted
 
 Times = NDArray[np.int64]
 
@@ -101,7 +102,7 @@ def _of_slots(bag: Bag, topics: list[str]) -> Measurement:
     ways = {name: PacketOutcomes(codes[np.searchsorted(stamps, common)]) for name, (stamps, codes, _) in found.items()}
     step = int(np.median(np.diff(common))) if len(common) > 1 else 0
     missing = 0 if step == 0 else round((int(common[-1]) - int(common[0])) / step) + 1 - len(common)
-    notes = (f"{missing} slots are missing from the recording",) if missing else ()
+    notes = (f"{counted(missing, 'slot is', 'slots are')} missing from the recording",) if missing else ()
     return Measurement(
         source=str(bag.path), format="bag", sent=(common - common[0]) * _NS, uplink=ways.get("uplink"),
         downlink=ways.get("downlink"), notes=(*notes, "outcomes are those that the relay recorded slot by slot"),
@@ -115,11 +116,14 @@ def measure_topic(bag: Bag, topic: str, period: float | None = None) -> Measurem
     """
     logged = bag.log_times(topic)
     if len(logged) < 3:
-        raise MeasurementError(f"{bag.path}: {topic} has {len(logged)} messages: too few for a period")
+        raise MeasurementError(f"{bag.path}: {topic} has {counted(len(logged), 'message')}: too few for a period")
     stamps = _stamps(bag.arrays[topic]) if topic in bag.arrays else None
     notes = []
     if stamps is not None and not stamps.all():
-        notes.append(f"{np.count_nonzero(stamps == 0)} messages have no stamp: the log times stand for all of them")
+        notes.append(
+            f"{counted(int(np.count_nonzero(stamps == 0)), 'message has', 'messages have')} no stamp: the log times "
+            "stand for all of them"
+        )
         stamps = None
     elif stamps is None:
         notes.append("the messages have no stamps: the log times stand for them")

@@ -45,6 +45,7 @@ from agv_analysis.link.measurement import (
 )
 from agv_analysis.link.packet_grid import PacketGrid
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 
 
 def _matches(head: bytes, path: Path) -> bool:
@@ -228,7 +229,8 @@ def _of_two(path: Path, other: Path, malformed: Malformed, options: Options) -> 
         times.extend(sent[part] - sent[0])
     notes = (
         f"the flow from {_address(flow[0], flow[1])} to {_address(flow[2], flow[3])}, {matched[chosen]} of "
-        f"{len(sent)} packets matched; it is taken for the uplink, and delays are as good as the two clocks agree",
+        f"{counted(len(sent), 'packet')} matched; it is taken for the uplink, and delays are as good as the two "
+        "clocks agree",
         *others,
     )
     return Measurement(

@@ -54,6 +54,7 @@ from agv_analysis.link.measurement import (
 )
 from agv_analysis.link.packet_grid import CountedOn, PacketGrid, spread_equal
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 
 _DIRECTIONS = ("uplink_lost", "downlink_lost")
 _ALWAYS_FLAGS = ("lost", *_DIRECTIONS)
@@ -148,7 +149,11 @@ def _missing(seq: Floats | None) -> list[str]:
         return []
     steps = (np.diff(seq[part.start : part.stop + 1]) for part in parts(len(seq) - 1, seq))
     count = sum(int(np.count_nonzero(part > 1.0)) for part in steps)
-    return [f"numbers are missing in {count} places, and what became of these packets is not known"] if count else []
+    return (
+        [f"numbers are missing in {counted(count, 'place')}, and what became of these packets is not known"]
+        if count
+        else []
+    )
 
 
 def _outcomes(
@@ -258,7 +263,8 @@ def _numbered(source: str, found: PacketGrid, delays: Sequence[str], rows: Table
     grid = found.whole(options.interval or 1.0)
     if 2 * grid.duplicates > found.records - grid.duplicates:
         notes.append(
-            f"{grid.duplicates} rows have the number of an earlier one: if they are answers, what was lost does not "
+            f"{counted(grid.duplicates, 'row has', 'rows have')} the number of an earlier one: if they are "
+            "answers, what was lost does not "
             "show, and a table of one direction is needed"
         )
     if found.dated >= 2:
@@ -283,7 +289,8 @@ def _spread(sent: Floats, options: Options) -> list[str]:
     if count < 3 or median_step(sent) > 0.0:
         return []
     return [
-        f"{spread_equal(sent)} of {count} packets have the time of the one before, and are spread evenly up to the "
+        f"{spread_equal(sent)} of {counted(count, 'packet has', 'packets have')} the time of the one before, and "
+        "are spread evenly up to the "
         "next time: durations are as coarse as the stamps"
     ]
 

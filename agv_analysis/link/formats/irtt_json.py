@@ -46,6 +46,7 @@ from agv_analysis.link.measurement import (
 )
 from agv_analysis.link.packet_grid import count_on
 from agv_analysis.run import Floats
+from agv_ros.counted import counted
 
 _BEGIN = re.compile(rb'"round_trips"\s*:\s*\[')
 _TEXT = re.compile(rb'"(?:[^"\\]|\\.)*(?:"|\\?\Z)', re.DOTALL)
@@ -334,13 +335,16 @@ def _measurement(source: str, table: _Table, malformed: Malformed, stated: list[
     )
     missing = int(seq[-1] - seq[0]) + 1 - len(seq)
     if missing:
-        notes.append(f"{missing} numbers are missing from the file, and what became of these packets is not known")
+        notes.append(
+            f"{counted(missing, 'number is', 'numbers are')} missing from the file, and what became of these "
+            "packets is not known"
+        )
     blind = count_of(word, lambda part: part == _WORDS["true"])
     if blind:
         notes.append(f"of {blind} lost packets irtt does not know on which way (lost is true): see --stats of irtt")
     untold = count_of(word, lambda part: part == _WORDS[""])
     if untold:
-        notes.append(f"of {untold} packets the file does not say what became of them")
+        notes.append(f"of {counted(untold, 'packet')} the file does not say what became of them")
     for delay, codes in zip(delays, (up, whole, whole), strict=True):
         forget(delay, codes, RECEIVED)
     found = [None if is_all_nan(delay) else delay for delay in delays]

@@ -20,6 +20,7 @@ from agv_analysis.stability.confidence.growth_posterior import SURE, GrowthPoste
 from agv_analysis.stability.confidence.interval_growth import IntervalGrowth, grows_for_a_while, interval_growth
 from agv_analysis.stability.floquet import drop_sequence
 from agv_analysis.stability.linear_loop import MARGINAL, LinearLoop
+from agv_ros.counted import counted
 
 GILBERT, RENEWAL, BLOCKS, PERIODIC, PREDICTED = (
     "gilbert",
@@ -131,7 +132,7 @@ def _of_exact_predictor(loop: LinearLoop, lost: Outcomes) -> _Found:
         return _Found(PREDICTED, 0.0, 0.0, (0.0, 0.0), None, "nothing was received")
     since = int(np.argmin(lost[::-1]))  # slots since the last pose: that outages leave nothing holds when one ends
     if since > len(lost) // 2:
-        why = f"nothing was received in the last {since} of {len(lost)} slots"
+        why = f"nothing was received in the last {since} of {counted(len(lost), 'slot')}"
         return _Found(PREDICTED, 0.5, 0.0, (0.0, 0.0), None, why)
     growth = mean_square.lap_growth(loop, bernoulli(0.0)) / loop.steps
     why = "the edge's model is exact, so that losses leave nothing of the error"
@@ -143,7 +144,7 @@ def _of_period(loop: LinearLoop, lost: Outcomes, period: int) -> _Found:
     periods, growth = len(lost) // period, growth_of_period(loop, lost[-period:])
     goes_on = (periods + 0.5) / (periods + 1.0)
     stable = growth < MARGINAL
-    why = f"the outcomes repeat every {period} slots, {periods} times, and over their period the error " + (
+    why = f"the outcomes repeat every {counted(period, 'slot')}, {periods} times, and over their period the error " + (
         "shrinks" if stable else "grows"
     )
     needed = 0.5 / (1.0 - SURE)
@@ -166,16 +167,16 @@ def _whole(loop: LinearLoop, period: int) -> int:
 def _of_gilbert(posterior: GrowthPosterior, intervals: Intervals, goodness: Goodness) -> _Found:
     probability, count = posterior.probability_stable, len(intervals.outages)
     if goodness.fits:
-        why = f"a Gilbert channel describes the outcomes, of {_counted(count, 'complete outage')}"
+        why = f"a Gilbert channel describes the outcomes, of {counted(count, 'complete outage')}"
         if count < _FEW:
-            why = f"only {_counted(count, 'complete outage')} was seen" if count == 1 else (
-                f"only {count} complete outages were seen" if count else "no complete outage was seen"
-            )  # fmt: skip
+            seen = counted(count, "complete outage was", "complete outages were")
+            why = f"only {seen} seen" if count else "no complete outage was seen"
     else:  # too little to judge without a model, and the model is wrong: it may not be what makes the word green
         probability = min(probability, 0.5)
-        why = f"a Gilbert channel does not describe the outcomes, and {_counted(count, 'complete outage')} are too few"
+        few = counted(count, "complete outage is", "complete outages are")
+        why = f"a Gilbert channel does not describe the outcomes, and {few} too few"
     if intervals.longest_open and intervals.longest_open >= intervals.outages.max(initial=0):
-        why += f"; an outage of at least {intervals.longest_open} slots was not seen whole"
+        why += f"; an outage of at least {counted(intervals.longest_open, 'slot')} was not seen whole"
     if probability > 1.0 - SURE and goodness.fits and tail_is_heavy(intervals.outages, _ADVANTAGE):
         probability, why = min(probability, 0.5), _HEAVY
     undecided = 1.0 - SURE < probability < SURE
@@ -199,7 +200,10 @@ def _of_intervals(loop: LinearLoop, intervals: Intervals, goodness: Goodness, mo
         probability = 0.5
         why = "outages come in clusters within which the error grows, and it is not known how long these may last"
     elif probability < SURE and _share_of_longest(intervals) > 0.2:
-        why += f"; the longest outage of {intervals.longest} slots alone makes up {_share_of_longest(intervals):.0%} "
+        why += (
+            f"; the longest outage of {counted(intervals.longest, 'slot')} alone makes up "
+            f"{_share_of_longest(intervals):.0%} "
+        )
         why += "of the sum of their squares"
     longer = None if heavy or probability == 0.5 else _times_longer(found, probability)
     return _Found(
@@ -227,10 +231,6 @@ def _times_longer(found: IntervalGrowth, probability: float) -> float | None:
 def _interval(estimate: float, samples: Floats) -> tuple[float, float]:
     low, high = np.quantile(samples, [0.0225, 0.9775])
     return min(estimate, float(low)), max(estimate, float(high))
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _two_digits(seconds: float) -> float:

@@ -25,6 +25,7 @@ from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margin_map_points import LIMIT, largest_repeated_bursts
 from agv_analysis.stability.scenario_loop import straight_loop_of
+from agv_ros.counted import counted
 
 LONGEST, LONGEST_PREDICTED = 1000, 200
 """Longest bursts [slots] that are tried; fewer behind a predictor, where nothing ends the search early."""
@@ -51,7 +52,7 @@ def _judge(facts: RunFacts) -> Judgement | None:
     found = joint_spectral_radius.verdict(facts.loop.thinned(PLACES_OF_LONG_LAP), facts.n)
     stable = {joint_spectral_radius.STABLE: True, UNSTABLE: False}.get(found.verdict)
     return Judgement(
-        f"Any outages up to {facts.n} slots", stable, _why(found),
+        f"Any outages up to {counted(facts.n, 'slot')}", stable, _why(found),
         {
             "bursts_stable": stable is True,
             "bursts_verdict": found.verdict,
@@ -67,7 +68,7 @@ def _why(found: BurstVerdict) -> str:
         proof = "proved by a common norm" if found.certificate is not None else "of the one sequence without outages"
         return f"joint spectral radius at most {found.upper:.6g}, {proof}"
     if found.verdict == UNSTABLE:
-        return f"outages of {found.worst} slots grow by {found.lower:.6g} a step"
+        return f"outages of {counted(found.worst, 'slot')} grow by {found.lower:.6g} a step"
     return f"joint spectral radius at least {found.lower:.6g}"
 
 
@@ -77,7 +78,7 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
     n, refuted = largest_n(loop, longest)
     reason = ""
     if n is None:
-        reason = f"no bound: every burst that was tried contracts, up to {longest} slots"
+        reason = f"no bound: every burst that was tried contracts, up to {counted(longest, 'slot')}"
     elif refuted is not None and refuted > n + 1:
         reason = f"proved up to {n}, refuted from {refuted} on, between them undecided"
     yield Margin(name, label, n, "" if n is None else steps_text(n, loop.ts), reason)

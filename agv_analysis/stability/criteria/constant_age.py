@@ -27,6 +27,7 @@ from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.margin_map_points import LIMIT, largest_delays
 from agv_analysis.stability.scenario_loop import straight_loop_of
 from agv_plant.parameters import ChannelParameters
+from agv_ros.counted import counted
 
 LONGEST, LONGEST_PREDICTED = 10_000, 1000
 """Longest constant delay [steps] that is tried; shorter behind a predictor, where each takes longer."""
@@ -43,7 +44,7 @@ def _judge(facts: RunFacts) -> Judgement | None:
         return None
     radius = lifted.largest_radius(facts.loop.thinned(PLACES_OF_LONG_LAP), facts.n)
     return Judgement(
-        f"Pose always {facts.n} steps old", radius < 1.0, f"lifted system, spectral radius {radius:.6g}",
+        f"Pose always {counted(facts.n, 'step')} old", radius < 1.0, f"lifted system, spectral radius {radius:.6g}",
         {"lifted_stable": radius < 1.0, "lifted_radius": finite(radius)}, radius,
     )  # fmt: skip
 

@@ -23,6 +23,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.stability.error_dynamics import NoNominalMotionError
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import lap_of, loop_of_run, loop_on_lap
+from agv_ros.counted import counted
 
 PLACES_OF_LONG_LAP = 20_000
 """Steps, at least, that are asked of a lap that has more: one of 100 s at 5 ms has so many."""
@@ -209,7 +210,7 @@ class Criterion:
 
 def steps_text(n: int, ts: float) -> str:
     """A number of steps that a scenario can take, with its time."""
-    return "does not contract even without outages" if n < 0 else f"{n} steps ({n * ts * 1e3:g} ms)"
+    return "does not contract even without outages" if n < 0 else f"{counted(n, 'step')} ({n * ts * 1e3:g} ms)"
 
 
 def growth_text(growth: float) -> str:

@@ -18,6 +18,7 @@ from agv_analysis.stability.criteria.criterion import (
 )
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_plant.parameters import RelayParameters
+from agv_ros.counted import counted
 
 _PLACES, _FEWEST, _WORK = 2000, 50, 2e7
 """Places of a lap at which a run is judged, at most and at least, and numbers to be moved over them, see `work`."""
@@ -65,7 +66,7 @@ def _thinned(loop: LinearLoop, ages: AgeChain, work: float, places: int) -> Line
 def _why_not(loop: LinearLoop, ages: AgeChain) -> str:
     """Why there is no answer for a loop and its chain of ages; empty if there is one."""
     if delayed_mean_square.work(loop, ages) > delayed_mean_square.MOST_WORK:
-        return f"poses may be {ages.oldest} slots late, which would take too long to compute"
+        return f"poses may be {counted(ages.oldest, 'slot')} late, which would take too long to compute"
     return ""
 
 

@@ -29,8 +29,8 @@ from agv_analysis.sweep.plan import Part, Sweep, SweepError, parse_axis
 from agv_analysis.sweep.rows_file import write_rows
 from agv_analysis.sweep.store import Store
 from agv_analysis.sweep.summary import quantiles
-from agv_analysis.sweep.sweep_sentence import sweep_sentence
-from agv_analysis.sweep.verdicts import counted, with_verdicts
+from agv_analysis.sweep.sweep_sentence import sweep_reason, sweep_sentence
+from agv_analysis.sweep.verdicts import with_verdicts, words_said
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
@@ -283,8 +283,8 @@ def test_runs_shorter_than_the_transient_do_not_make_a_stable_loop_unstable() ->
     assert np.isnan(stable["instability"])
     assert (stable["instability_low"], stable["instability_high"]) == (0.0, 1.0)
     assert unstable["verdict"] == "unstable"
-    assert "at 0, and in no run at 0; at 2 runs are too short to say" in sweep_sentence([stable, unstable])
-    assert counted([stable, unstable]) == "1 mean-square, 1 unstable"
+    assert "by the verdict at 0; at 2 points runs are too short to say" in sweep_sentence([stable, unstable])
+    assert words_said([stable, unstable]) == "1 mean-square, 1 unstable"
 
 
 def test_a_loop_that_does_not_settle_is_not_called_stable_by_the_headline() -> None:
@@ -293,11 +293,12 @@ def test_a_loop_that_does_not_settle_is_not_called_stable_by_the_headline() -> N
     rows = with_verdicts(sweep, rows_of(sweep))
     assert [row["verdict"] for row in rows] == ["infeasible", "asymptotic"]
     assert "falls behind its reference by 0.2 m/s" in rows[0]["verdict_reason"]
+    assert sweep_reason(rows, *sweep.axes) == rows[0]["verdict_reason"]
     assert (
         sweep_sentence(rows)
         == "Of 2 points the loop is stable in all runs and by the verdict at 1, and in no run at 1."
     )
-    assert sweep_sentence(rows[1:]) == "The loop is stable in all runs and by the verdict at all 1 points."
+    assert sweep_sentence(rows[1:]) == "The loop is stable in all runs and by the verdict at the only point."
     assert "at 0" in sweep_sentence([rows[1] | {"verdict": "bounded"}])
 
 
@@ -496,3 +497,25 @@ def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(
     assert agv_ncs(*arguments, tmp_path / "whole")[0] == 0
     whole = (tmp_path / "whole" / "points.csv").read_text()
     assert (tmp_path / "stopped" / "points.csv").read_text() == whole
+
+
+def test_the_reason_is_the_one_that_most_points_share_whatever_its_numbers() -> None:
+    kx = sweep_of("controller.kx=25.0,60.0,250.0,300.0").axes
+
+    def row(kx: float, unstable: int, reason: str) -> dict[str, Any]:
+        said = {"verdict": "unstable" if unstable else "mean-square", "verdict_reason": reason}
+        return {"controller.kx": kx, "runs": 10, "unstable": unstable, "settles_without_losses": True, **said}
+
+    rows = [
+        row(25.0, 0, "it dies out"),
+        row(60.0, 9, "it grows"),
+        row(250.0, 10, "converge in 3 of 10 runs only"),
+        row(300.0, 10, "converge in 0 of 10 runs only"),
+    ]
+    shared = "at 2 of the 3 points that are not stable, as at controller.kx 250: converge in 3 of 10 runs only"
+    assert sweep_reason(rows, *kx) == shared
+    assert sweep_reason(rows[:2], *kx) == "it grows"
+    assert sweep_reason(rows[:1], *kx) == "it dies out"
+    runs_alone = [{name: value for name, value in row.items() if "verdict" not in name} for row in rows]
+    assert sweep_reason(runs_alone, *kx).endswith("do not come closer in the simulated runs")
+    assert sweep_reason([], *kx) == ""
