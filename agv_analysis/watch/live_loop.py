@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 from agv_analysis.metrics.bands import TOLERANCE
 from agv_analysis.scenario import Scenario
@@ -47,8 +47,9 @@ may be missed."""
 _DEVIATION = POINTS.index("deviation")
 _X, _X_E, _AGE = (COLUMNS.index(name) for name in ("x", "x_e", "age"))
 
-_RECENT = 20
-"""Steps in which the newest value is looked for."""
+_RECENT, _BEFORE = 20, 1.0
+"""Steps in which the newest value is looked for first, and time [s] before them in which it is looked for then: of a
+busy machine's messages a page may miss all of one topic for tenths of a second."""
 
 _BEHIND, _MOST_BEHIND = 2, 60
 """Points are made so many points late, when the messages of their steps are here, and at most so many."""
@@ -102,7 +103,7 @@ class LiveLoop:
         """Points that are kept no longer."""
         self._largest = LargestOfLast(max(1, round(LOOK_BACK / (self.steps_per_point * self.ts))))
         self._recent: list[list[float]] | None = None
-        """Rows of the last steps; None: messages have come since they were looked up."""
+        """Rows of the last steps, the newest first; None: messages have come since they were looked up."""
         self._last_slot = self._last_command_slot = -1
         self._next_point = -1
         self._newest_ns = 0
@@ -240,20 +241,22 @@ class LiveLoop:
     def latest(self, name: str) -> float:
         """The newest value that is known of a column; NaN if there is none in the last steps."""
         place = COLUMNS.index(name)
-        return next((row[place] for row in reversed(self._recent_rows()) if not math.isnan(row[place])), math.nan)
+        return next((row[place] for row in self._newest_first() if not math.isnan(row[place])), math.nan)
 
     def latest_deviation(self) -> tuple[int, float]:
         """The newest step whose deviation is known, and it [m]; -1 and NaN if there is none in the last steps."""
-        for back, row in enumerate(reversed(self._recent_rows())):
+        for back, row in enumerate(self._newest_first()):
             if not math.isnan(found := self._deviation(self.k - back, row)):
                 return self.k - back, found
         return -1, math.nan
 
-    def _recent_rows(self) -> list[list[float]]:
-        """What is known of the last steps up to `k`, looked up once after each take: a page asks for several values."""
+    def _newest_first(self) -> Iterator[list[float]]:
+        """What is known of the steps from `k` back; the first ones are looked up once after each take."""
+        begin = max(0, self.k + 1 - _RECENT)
         if self._recent is None:
-            self._recent = self.ring.rows(max(0, self.k - _RECENT), self.k + 1).tolist()
-        return self._recent
+            self._recent = self.ring.rows(begin, self.k + 1)[::-1].tolist()
+        yield from self._recent
+        yield from self.ring.rows(max(0, begin - math.ceil(_BEFORE / self.ts)), begin)[::-1].tolist()
 
     def not_covered(self) -> str:
         """Why the links are none of which the margin knows; empty if they are."""

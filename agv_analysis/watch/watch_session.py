@@ -42,7 +42,7 @@ _LEAD = 0.4
 _LEAST_REST, _SHARE = 5.0, 9.0
 """Between two margins pass so many seconds and so many times what the last one took: a tenth of a core at most."""
 
-_MORE = 0.2
+_MORE = 0.4
 """A margin is computed anew once it lacks such a share of the slots or of the losses that it was computed from."""
 
 _QUIET = 1.0
@@ -50,7 +50,7 @@ _QUIET = 1.0
 
 _ASK_AGAIN = 0.25
 
-_FAREWELL = 1.0
+_FAREWELL = 3.0
 """How long [s] the end waits for pages that have not taken the last frame."""
 
 

@@ -106,6 +106,18 @@ def test_what_is_not_seen_is_counted_and_not_made_up() -> None:
     )
 
 
+def test_the_newest_value_is_that_before_a_gap_of_its_topic() -> None:
+    loop, k = LiveLoop(scenario()), 1949
+    late = scenario().grid.stamp(k)
+    loop.take(
+        heard for heard in messages(run()) if heard.topic != TOPICS.index("agv/pose") or heard.received_ns <= late
+    )
+    assert loop.k == 1999
+    distance = math.hypot(*(run().pose[k, :2] - run().reference[k, :2]))
+    assert loop.latest_deviation() == (k, pytest.approx(distance, abs=1e-12))
+    assert loop.latest("x") == run().pose[k, 0]
+
+
 def test_a_wild_stamp_is_refused_and_a_loop_that_has_leapt_is_followed() -> None:
     loop, grid = LiveLoop(scenario()), scenario().grid
     window = round(FAR / scenario().plant.ts)
