@@ -17,7 +17,7 @@ from agv_analysis.stability.analysis import analyse
 from agv_analysis.watch.controls import controls_of
 from agv_analysis.watch.link_margin import NOT_COVERED, STABLE, UNSTABLE, LinkMargin, link_margin
 from agv_analysis.watch.live_loop import FAR, POINTS, TOPICS, LiveLoop
-from agv_analysis.watch.live_tiles import live_tiles
+from agv_analysis.watch.live_tiles import live_tiles, metres
 from agv_analysis.watch.message_log import Heard, MessageLog
 from agv_analysis.watch.outage_order import with_outage
 from agv_analysis.watch.step_ring import StepRing, column
@@ -154,6 +154,15 @@ def test_the_tiles_say_what_the_analysis_says(seen: LiveLoop) -> None:
     assert tiles["deviation"].note == f"at most {largest:.3f} m in the last 10 s"
     assert tiles["corridor"].value == f"0.25 m: {'left' if largest > 0.25 else 'kept'}"
     assert tiles["deadlines"].value == "3"
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(0.15374, "0.154 m"), (9.9994, "9.999 m"), (12.3456, "12.35 m"), (6354.381, "6354 m"), (math.nan, "not known"),
+     (math.inf, "diverges")],
+)  # fmt: skip
+def test_distances_have_millimetres_where_they_mean_something(value: float, said: str) -> None:
+    assert metres(value) == said
 
 
 def test_nothing_is_called_stable_whose_commands_came_late(seen: LiveLoop) -> None:

@@ -32,6 +32,7 @@ from agv_analysis.runtime.runner import run_in_process
 from agv_analysis.scenario import load_scenario
 from agv_analysis.watch.beside_run import watcher_beside
 from agv_analysis.watch.live_loop import TOPICS
+from agv_analysis.watch.live_tiles import metres
 from agv_cloud.reference.reference import Reference
 from test.test_loop import changed_topics
 
@@ -178,7 +179,8 @@ def test_the_numbers_on_the_page_are_those_in_the_bag(watched: Watched) -> None:
     assert now["deviation"] == pytest.approx(math.hypot(x - reference[0], y - reference[1]), abs=1e-12)
     assert (now["x"], now["y"]) == pytest.approx((x, y), abs=1e-4)
     assert watched.tiles["losses"].splitlines()[1] == f"{100.0 * now['lost'] / now['slots']:.2f} %"
-    assert watched.tiles["deviation"].splitlines()[1] == f"{now['deviation']:.3f} m"
+    # At the gain that the slider has set, a busy machine may miss so many deadlines that the AGV leaves its track far.
+    assert watched.tiles["deviation"].splitlines()[1] == metres(now["deviation"])
     assert watched.tiles["outage"].splitlines()[1] == f"{now['longest']} slots ({now['longest'] * 5} ms)"
     assert watched.log == []
 
