@@ -17,21 +17,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agv_analysis.compiled.functions import numbers
+from agv_analysis.compiled.functions import compiled, numbers
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.rare_leaving import leaving_rate, outages_of
-from agv_analysis.corridor.shares import path_shares
 from agv_analysis.corridor.single_outage import SingleOutage
+from agv_analysis.corridor.widths import Widths, share_of
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.link.markov_channel import Chain, chain_of
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.batch import cores
 from agv_analysis.simulation.channel_outcomes import ChannelRealisation
-from agv_analysis.simulation.loop import RunInputs, history
+from agv_analysis.simulation.loop import Rows, RunInputs, history
 from agv_analysis.simulation.parts import replacements_of, run_parts
 from agv_analysis.simulation.single import settings_of, simulate
 from agv_analysis.simulation.trace_windows import parts_of_traces, with_windows
+from agv_cloud.tracking_error import tracking_error
 from agv_plant.channels.registry import TRACE
 from agv_plant.parameters import ChannelParameters
 from agv_plant.vehicle.motion import NOISE, SLIP
@@ -233,7 +234,7 @@ def _direct_lap(loop: LapLoop, scenario: Scenario, seed: int, skipped: int) -> L
     rows, n_ul = np.full((steps, 8), math.nan), np.empty(steps, dtype=np.int64)
     reference = loop.reference(2 * loop.steps)
     run_parts(history, replacements_of(scenario), numbers(reference), inputs, rows, n_ul)
-    return _seen(loop, rows[skipped:, :3], reference[skipped:steps])
+    return _seen(loop, rows, reference, skipped)
 
 
 def _simulated_lap(loop: LapLoop, scenario: Scenario, seed: int, skipped: int) -> Lap:
@@ -244,14 +245,29 @@ def _simulated_lap(loop: LapLoop, scenario: Scenario, seed: int, skipped: int) -
     run = simulate(replace(scenario, plant=plant, relay=replace(scenario.relay, seed=seed)))
     pose = np.full((skipped + loop.steps, 3), math.nan)
     pose[: len(run)] = run.pose
-    reference = loop.reference(2 * loop.steps)
-    return _seen(loop, pose[skipped:], reference[skipped : len(pose)])
+    return _seen(loop, pose, loop.reference(2 * loop.steps), skipped)
 
 
-def _seen(loop: LapLoop, pose: Floats, reference: Floats) -> Lap:
-    shares = path_shares(pose, reference, loop.widths)
-    outside = np.flatnonzero(shares > 1.0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        square = float(np.square(pose[:, :2] - reference[:, :2]).sum(axis=1).mean())
-    steps = int(outside[0]) if len(outside) else len(shares)
-    return Lap(float(shares.max()), steps, square if math.isfinite(square) else math.inf)
+def _seen(loop: LapLoop, pose: Floats, reference: Floats, skipped: int) -> Lap:
+    """What is kept of poses, shape (N, 3) or with more columns, without the first `skipped`."""
+    share, steps, square = compiled(largest_share)(numbers(pose), numbers(reference), skipped, loop.widths)
+    return Lap(share, steps, square if math.isfinite(square) else math.inf)
+
+
+def largest_share(pose: Rows, reference: Rows, skipped: int, widths: Widths) -> tuple[float, int, float]:
+    """Largest share of the corridor that a path uses, steps until it is left or all, and its mean squared distance.
+
+    Poses and reference of as many steps or more; the first `skipped` do not count.
+    """
+    count = len(pose) - skipped
+    largest, left, square = 0.0, count, 0.0
+    for k in range(count):
+        at, now = pose[skipped + k], reference[skipped + k]
+        along, across, _ = tracking_error(at[0], at[1], at[2], now[0], now[1], now[2])
+        share = share_of(along, across, widths)
+        largest = max(largest, share)
+        if share > 1.0 and left == count:
+            left = k
+        dx, dy = at[0] - now[0], at[1] - now[1]
+        square += dx * dx + dy * dy
+    return largest, left, square / count

@@ -7,12 +7,12 @@ reception between two, for several j, until they repeat what they do. So this bo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from agv_analysis.corridor.lap_loop import LapLoop, Outcomes
+from agv_analysis.corridor.lap_loop import Excursions, LapLoop, Outcomes
 from agv_analysis.run import Floats
 
 _PLACES = 200
@@ -58,11 +58,8 @@ def alternating(n: int, other: int) -> Outcomes:
 
 def worst_sequence(loop: LapLoop, n: int, more: Iterable[Outcomes] = ()) -> WorstSequence:
     """The worst of all that were tried with outages of up to `n` slots, and of `more` that the caller knows of."""
-    others = np.unique(np.linspace(0, n, _OTHERS).round().astype(int)).tolist()
-    every = max(1, loop.steps // _PLACES)
     best, shares = None, np.full(loop.steps, np.nan)
-    for outcomes in (*(alternating(n, other) for other in others), *more):
-        found, _ = loop.excursions(outcomes, every, limit=_FAR)
+    for outcomes, found in _tried(loop, n, more):
         at = (found.steps + found.after) % loop.steps
         shares[at] = np.fmax(shares[at], found.share)
         worst = found.worst
@@ -74,6 +71,14 @@ def worst_sequence(loop: LapLoop, n: int, more: Iterable[Outcomes] = ()) -> Wors
     return best
 
 
+def _tried(loop: LapLoop, n: int, more: Iterable[Outcomes] = ()) -> Iterator[tuple[Outcomes, Excursions]]:
+    """Sequences with outages of up to `n` slots, and what each does; driven as they are asked for."""
+    others = np.unique(np.linspace(0, n, _OTHERS).round().astype(int)).tolist()
+    every = max(1, loop.steps // _PLACES)
+    for outcomes in (*(alternating(n, other) for other in others), *more):
+        yield outcomes, loop.excursions(outcomes, every, limit=_FAR)[0]
+
+
 _FAR = 1e6
 """Share of the corridor beyond which it does not matter how much further a sequence leads."""
 
@@ -83,15 +88,19 @@ def largest_n(loop: LapLoop, longest: int) -> tuple[int, WorstSequence]:
 
     With `longest` the sequence is the worst of that length, which stays inside. -1: it is left without any outage.
     """
-    inside, outside, found = -1, longest + 1, None
-    attempt = longest
+    found = worst_sequence(loop, longest)
+    if not found.share > 1.0:
+        return longest, found
+    # What leaves is mostly just shorter: downwards in growing strides, then by bisection.
+    outside, inside, stride = longest, max(-1, longest - 1), 2
+    while inside >= 0 and _leaves(loop, inside):
+        outside, inside, stride = inside, max(-1, inside - stride), 2 * stride
     while outside - inside > 1:
-        tried = worst_sequence(loop, attempt)
-        if tried.share > 1.0:
-            outside, found = attempt, tried
-        else:
-            inside = attempt
-            found = tried if found is None else found
-        attempt = (inside + outside) // 2
-    assert found is not None
-    return inside, found
+        middle = (inside + outside) // 2
+        inside, outside = (inside, middle) if _leaves(loop, middle) else (middle, outside)
+    return inside, found if outside == longest else worst_sequence(loop, outside)
+
+
+def _leaves(loop: LapLoop, n: int) -> bool:
+    """Does any of the sequences with outages of up to `n` slots lead out of the corridor?"""
+    return any(found.share[found.worst] > 1.0 for _, found in _tried(loop, n))

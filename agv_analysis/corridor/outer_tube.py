@@ -38,7 +38,7 @@ from agv_analysis.corridor.lap_loop import LapLoop, outage
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
-from agv_analysis.stability.products import assign, multiply, of_size_3
+from agv_analysis.stability.products import IDENTITY, times
 from agv_analysis.stability.reception_maps import burst_maps
 
 _SIDES, _SIDES_OF_LONG = 32, 16
@@ -229,7 +229,7 @@ def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Fl
     limit = _FARTHER * min(widths.distance, max(widths.along, widths.across))
     bounds = np.empty((lap, len(template.directions)))
     begins = (0, lap // 2 // apart * apart) if lap >= 2 * max(warm_up, n + 2) else (0,)
-    drive = compiled(_push, of_size_3(linear.F, linear.G))
+    drive = compiled(_push)
     matrices = linear.F, linear.G, linear.H, linear.K
     arguments = *matrices, bias.rows, bias.every, rows, remainder, template.directions, template.lever, apart
 
@@ -264,77 +264,68 @@ def _push(
     are opposite are looked at together.
     """
     count, longest, sides = directions.shape[0], window.shape[0] - 1, directions.shape[0] - 2
-    size, half = F.shape[1], (directions.shape[0] - 2) // 2
-    M, M_next = np.empty((size, size)), np.empty((size, size))
-    N, N_next = np.empty((size, size)), np.empty((size, size))
-    per_sine, per_lever = 1.0 / math.sin(2.0 * math.pi / sides), 1.0 / lever
+    half, per_sine, per_lever = sides // 2, 1.0 / math.sin(2.0 * math.pi / sides), 1.0 / lever
+    y_of, t_of = directions[2:, 1].copy(), directions[2:, 2].copy()
     c_y, c_t = directions[2:, 1].copy(), directions[2:, 2] / lever
-    sectors = np.zeros(half + 1, dtype=np.int64)
-    across = np.empty(sides, dtype=np.int64)
-    for i in range(sides):
-        across[i] = (i + half) % sides
+    of_y, of_t = np.empty(sides), np.empty(sides)
+    sectors = np.zeros(half, dtype=np.int64)
     for j in range(bounds.shape[0]):
         for i in range(count):
             bounds[j, i] = window[0, i]
         if not (max(window[0, 0], window[0, 1]) <= limit and max(window[0, 2], window[0, 2 + half]) <= limit):
             return False
+        for side in range(sides):  # in a sector V is of_y p_y + of_t p_t, by the directions at its sides
+            further = side + 1 if side + 1 < sides else 0
+            near, far = bounds[j, 2 + side] * per_sine, bounds[j, 2 + further] * per_sine
+            of_y[side] = c_t[further] * near - c_t[side] * far
+            of_t[side] = c_y[side] * far - c_y[further] * near
+        for i in range(half):
+            sectors[i] = i
+        M, N, skipped = IDENTITY, IDENTITY, 0
         until = longest if j % apart == 0 else 0
-        for i in range(size):
-            for p in range(size):
-                M[i, p] = N[i, p] = 1.0 if i == p else 0.0
-        for i in range(half + 1):
-            sectors[i] = max(0, i - 1)
         begun = (first + j) % lap
         before, after, share = neighbours(begun, every, bias.shape[0], lap)
-        part = begun * remainder.shape[0] // lap
+        part, row = begun * remainder.shape[0] // lap, (first + j) % F.shape[0]
         for length in range(1, until + 1):
-            row = (first + j + length - 1) % F.shape[0]
-            multiply(F[row], M, False, M_next, False)
-            multiply(G[row], N, False, M_next, True)
+            following = times(F[row], M, times(G[row], N))
             if H is not None:
-                multiply(H[row], N, False, N_next, False)
-                if K is not None:
-                    multiply(K[row], M, False, N_next, True)
-                assign(N_next, N)
-            assign(M_next, M)
-            if length % apart != 0:
+                N = times(H[row], N, times(K[row], M)) if K is not None else times(H[row], N)
+            M = following
+            row = row + 1 if row + 1 < F.shape[0] else 0
+            skipped = skipped + 1 if skipped + 1 < apart else 0  # slots since one that may be a reception
+            if skipped != 0:
                 continue
             b_x = (1.0 - share) * bias[before, length, 0] + share * bias[after, length, 0]
             b_y = (1.0 - share) * bias[before, length, 1] + share * bias[after, length, 1]
             b_t = (1.0 - share) * bias[before, length, 2] + share * bias[after, length, 2]
             r_x, r_y, r_t = remainder[part, length, 0], remainder[part, length, 1], remainder[part, length, 2]
-            for i in range(half + 1):
-                if i == 0:  # along x_e
-                    one, other, y, theta = 0, 1, 0.0, 0.0
-                    p_x, p_y, p_t = M[0, 0], M[0, 1], M[0, 2] * per_lever
-                    pushed, unknown = b_x, r_x
+            for i in range(-1, half):
+                if i < 0:  # along x_e
+                    p_x, p_y, p_t = M[0], M[1], M[2] * per_lever
+                    pushed, unknown, side, one, other = b_x, r_x, sectors[0], 0, 1
                 else:  # of the polygon
-                    one, other = i + 1, i + 1 + half
-                    y, theta = directions[one, 1], directions[one, 2]
-                    p_x = M[1, 0] * y + M[2, 0] * theta
-                    p_y = M[1, 1] * y + M[2, 1] * theta
-                    p_t = (M[1, 2] * y + M[2, 2] * theta) * per_lever
+                    y, theta = y_of[i], t_of[i]
+                    p_x, p_y = M[3] * y + M[6] * theta, M[4] * y + M[7] * theta
+                    p_t = (M[5] * y + M[8] * theta) * per_lever
                     pushed, unknown = b_y * y + b_t * theta, r_y * abs(y) + r_t * abs(theta)
-                ahead, behind = (bounds[j, 0], bounds[j, 1]) if p_x >= 0.0 else (bounds[j, 1], bounds[j, 0])
-                value, opposite = abs(p_x) * ahead, abs(p_x) * behind
-                side = sectors[i]
+                    side, one, other = sectors[i], 2 + i, 2 + i + half
                 # The sector that holds (p_y, p_t), searched for from where it was after one slot less.
                 for _ in range(sides):
                     further = side + 1 if side + 1 < sides else 0
-                    left, right = c_y[side] * p_t - c_t[side] * p_y, p_y * c_t[further] - p_t * c_y[further]
-                    if left >= 0.0 and right >= 0.0:
-                        near, far = bounds[j, 2 + side], bounds[j, 2 + further]
-                        value += (right * near + left * far) * per_sine
-                        near, far = bounds[j, 2 + across[side]], bounds[j, 2 + across[further]]
-                        opposite += (right * near + left * far) * per_sine
-                        sectors[i] = side
-                        break
-                    if left < 0.0 and c_y[side] * p_y + c_t[side] * p_t > 0.0:
+                    if c_y[side] * p_t < c_t[side] * p_y:
                         side = side - 1 if side > 0 else sides - 1
-                    else:
+                    elif p_y * c_t[further] < p_t * c_y[further]:
                         side = further
-                window[length, one] = max(window[length, one], value + pushed + unknown)
-                window[length, other] = max(window[length, other], opposite - pushed + unknown)
+                    else:
+                        break
+                if i >= 0:
+                    sectors[i] = side
+                opposite = side + half if side < half else side - half
+                ahead, behind = (bounds[j, 0], bounds[j, 1]) if p_x >= 0.0 else (bounds[j, 1], bounds[j, 0])
+                value = abs(p_x) * ahead + of_y[side] * p_y + of_t[side] * p_t + pushed + unknown
+                against = abs(p_x) * behind - of_y[opposite] * p_y - of_t[opposite] * p_t - pushed + unknown
+                window[length, one] = max(window[length, one], value)
+                window[length, other] = max(window[length, other], against)
         for length in range(longest):
             for i in range(count):
                 window[length, i] = window[length + 1, i]

@@ -34,10 +34,10 @@ FEW = 0.02
 """Share of the runs from a level up to which it does not matter that they were ended; with more there is no rate."""
 
 REPLICATES = 16
-"""Independent estimates of which the mean is taken."""
+"""Independent estimates that are put together."""
 
 _STUDENT = 2.131449546
-"""Of a mean of so many normal numbers with unknown variance: quantile 0.975 of Student's t with 15 degrees."""
+"""Of an estimate from so many with unknown variance: quantile 0.975 of Student's t with 15 degrees."""
 
 
 class Work(NamedTuple):
@@ -159,14 +159,37 @@ def rate_of(
 
     with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(estimate, range(REPLICATES)))
-    rates = found[:, 0] / work.base * np.prod(found[:, 1:] / work.trials, axis=1)
-    mean, spread = float(rates.mean()), float(rates.std(ddof=1)) / math.sqrt(REPLICATES)
     runs = REPLICATES * work.trials * (len(levels) - 1)
-    if mean == 0.0 or ended.max() > FEW * work.trials:
-        return Rate(Estimate(0.0, 0.0, 1.0), int(ended.sum()), runs)
-    # Products of estimates are skew: their logarithm is nearer to a normal number than they are.
-    factor = math.exp(min(_STUDENT * spread / mean, 700.0))
-    return Rate(Estimate(mean, mean / factor, min(1.0, mean * factor)), int(ended.sum()), runs)
+    if ended.max() > FEW * work.trials:
+        return Rate(_UNKNOWN, int(ended.sum()), runs)
+    return Rate(_pooled(found, work), int(ended.sum()), runs)
+
+
+_UNKNOWN = Estimate(0.0, 0.0, 1.0)
+
+
+def _pooled(hits: Floats, work: Work) -> Estimate:
+    """The rate by all replicates, of which `hits` has a row each, with the interval of its logarithm by the jackknife.
+
+    The probability of each level is estimated from all of them before these are multiplied: a mean of their products
+    would be skew, with its spread and itself too small at once. Unknown where it rests on a single replicate.
+    """
+    whole = _log_rate(hits, work)
+    without = np.array([_log_rate(np.delete(hits, i, axis=0), work) for i in range(len(hits))])
+    if not np.isfinite(without).all():
+        return _UNKNOWN
+    spread = math.sqrt((1.0 - 1.0 / len(hits)) * float(np.square(without - without.mean()).sum()))
+    low, value, high = (math.exp(min(whole + times * spread, 0.0)) for times in (-_STUDENT, 0.0, _STUDENT))
+    return Estimate(value, low, high)
+
+
+def _log_rate(hits: Floats, work: Work) -> float:
+    """Logarithm of the rate; -inf if the last level was never reached."""
+    started = (hits[:, :-1] > 0.0).sum(axis=0) * work.trials
+    of_levels = hits[:, 1:].sum(axis=0)
+    if hits[:, 0].sum() == 0.0 or (of_levels == 0.0).any():
+        return -math.inf
+    return float(math.log(hits[:, 0].mean() / work.base) + np.log(of_levels / started).sum())
 
 
 def tail_rate(chain: Chain) -> float:
