@@ -113,7 +113,7 @@ def leaving(
     laps = laps or max(_FEWEST, min(LAPS, _SLOTS // loop.steps))
     laps = laps if is_random(scenario) else min(laps, parts)  # further ones would be the same again
     driven = list(_laps(loop, scenario, laps, progress))
-    left, seconds = sum(lap.share > 1.0 for lap in driven), sum(lap.steps for lap in driven) * loop.ts
+    left, slots = sum(lap.share > 1.0 for lap in driven), sum(lap.steps for lap in driven)
     chain = chain_alone(loop.scenario)
     if left < ENOUGH and chain is not None and single is not None and single.n is not None and single.n >= 0:
         longer = 1.0 if n_proved is None or n_proved < 0 or left else outages_of(chain, n_proved + 1)
@@ -124,7 +124,9 @@ def leaving(
         if 0.0 < rate.per_slot.value * loop.steps < _RARE:
             return _of_rate(loop, rate.per_slot, driven, f"importance splitting with {counted(rate.runs, 'run')}")
     method = f"{laps} simulated laps, {left} of which left it"
-    return _of_laps(loop, Estimate.of(left, laps), seconds / left if left else None, driven, method)
+    # As if each slot inside were followed by a departure with the same probability.
+    in_a_slot = Estimate.of(left, max(left, slots)) if left else None
+    return _of_laps(loop, Estimate.of(left, laps), in_a_slot, slots / left if left else math.inf, driven, method)
 
 
 _NEVER = 1e-15
@@ -134,14 +136,17 @@ _RARE = 0.2
 """Expected number of times a lap up to which they count as independent of each other."""
 
 
-def _of_laps(loop: LapLoop, p: Estimate, mean: float | None, driven: list[Lap], method: str) -> Leaving:
+def _of_laps(
+    loop: LapLoop, p: Estimate, in_a_slot: Estimate | None, slots: float, driven: list[Lap], method: str
+) -> Leaving:  # fmt: skip
+    """By the probability of a lap, that of a slot, None if none left, and the mean number of slots inside."""
     lap = loop.steps * loop.ts
     per_hour = Estimate(*(_within(value, HOUR / lap) for value in (p.value, p.low, p.high)))
-    if mean is None:
+    if in_a_slot is None:
         low = -lap / math.log1p(-p.high)
         return Leaving(p, per_hour, Estimate(math.inf, low, math.inf), method, *_of_each(driven))
-    high = mean * p.value / p.low if p.low > 0.0 else math.inf
-    return Leaving(p, per_hour, Estimate.about(mean, mean * p.value / p.high, high), method, *_of_each(driven))
+    mean = Estimate.about(slots * loop.ts, loop.ts / in_a_slot.high, loop.ts / in_a_slot.low)
+    return Leaving(p, per_hour, mean, method, *_of_each(driven))
 
 
 def _within(p: float, times: float) -> float:

@@ -63,6 +63,18 @@ def test_rare_events_are_asked_of_splitting() -> None:
     assert found.mean_time.value == pytest.approx(10.0 / found.p_lap.value, rel=0.01)
 
 
+def test_the_mean_time_is_known_as_well_as_the_departures_are_many() -> None:
+    """Also where nearly each lap leaves, so that how many do hardly says how soon."""
+    laps = 60
+    found = of(0.05, "error_detector.track=line", laps=laps)
+    mean, left = found.mean_time, found.p_lap.value * laps
+    assert mean is not None
+    assert 0.8 < found.p_lap.value < 1.0
+    assert mean.value == pytest.approx(-10.0 / math.log1p(-found.p_lap.value), rel=0.25)
+    for end, sign in ((mean.high, 1.0), (mean.low, -1.0)):  # of a sum of so many exponential times, roughly
+        assert end / mean.value == pytest.approx(math.exp(sign * 1.96 / math.sqrt(left)), rel=0.03)
+
+
 def test_what_is_not_random_is_asked_of_one_lap() -> None:
     perfect = of(0.25, "relay.uplink.model=perfect")
     assert (perfect.p_lap.high, perfect.p_hour.high, perfect.mean_time) == (0.0, 0.0, None)
