@@ -201,9 +201,9 @@ def _headlines(sweep: Sweep, rows: list[dict[str, Any]]) -> Iterator[tuple[str, 
     from agv_analysis.sweep.sweep_sentence import best_point, is_calm, sweep_reason, sweep_sentence
 
     yield "Verdict", escape(sweep_sentence(rows, *sweep.axes))
-    if reason := sweep_reason(rows, *sweep.axes):
-        yield "Because", escape(reason)
     calm = [row for row in rows if is_calm(row)]
+    if reason := sweep_reason(rows, *sweep.axes):
+        yield "The others" if 0 < len(calm) < len(rows) else "Because", escape(reason)
     if not calm:
         return
     best = best_point(rows)

@@ -33,7 +33,7 @@ from agv_ros.errors import UserError
 N_ANY, P_HOUR = "n_any", "p_hour"
 
 TITLES = {
-    N_ANY: "longest outages in any order within the corridor",
+    N_ANY: "longest outage that the corridor allows",
     P_HOUR: "probability to leave the corridor in an hour",
 }
 

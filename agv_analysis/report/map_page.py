@@ -15,6 +15,7 @@ from agv_analysis.report.heat_map import colour_scale, heat_map_layout
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import plain
 from agv_analysis.report.sweep_table import number
+from agv_analysis.report.tiles import Tile
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.margin_map import TS, MarginMap, axes_of, map_columns
@@ -53,6 +54,7 @@ def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: st
         title="agv_ncs: map of margins",
         verdict=map_sentence(found, scenario),
         word="unknown",
+        tiles=list(_tiles(found, scenario)),
         at=f"{rows} by {counted(columns, 'point')} about the scenario's own",
         sections=[{"key": name, "title": _capital(titles[name]), "height": 460} for name in found.margins],
         chosen=_nearest(found, scenario),
@@ -74,6 +76,32 @@ def map_sentence(found: MarginMap, scenario: Scenario) -> str:
     )
     said = (f"{title}: {_texts(found, name)[i][j]}" for name, title in _shown(found))
     return f"At {at}: {'; '.join(said)}."
+
+
+def _tiles(found: MarginMap, scenario: Scenario) -> Iterator[Tile]:
+    """What is asked first of a map: what the scenario's own point survives, why no more, where, how far, how sure."""
+    i, j = divmod(_nearest(found, scenario), len(found.second))
+    slots = {name: margins for name, margins in found.margins.items() if name not in (N_ANY, P_HOUR)}
+    least = min(slots, key=lambda name: slots[name][i, j])
+    n, titles = int(slots[least][i, j]), _titles()
+    if n < 0:
+        yield Tile("word", "At this point", "unstable", "even without outages")
+    else:
+        note = f"the smallest margin, by which all of them are survived: {titles[least]}"
+        yield Tile("word", "Survived at this point", counted(n, "slot"), note)
+    without_outages = slots[least] >= 0
+    points = counted(without_outages.size, "point")
+    yield Tile(
+        "stable",
+        "Stable without outages",
+        f"{int(without_outages.sum())} of {points}",
+        "the others are beyond the dashed line",
+    )
+    if N_ANY in found.margins:
+        yield Tile("deviation", "Within the corridor", _texts(found, N_ANY)[i][j], titles[N_ANY])
+    else:
+        yield Tile("deviation", "How far it strays", "not asked", "--corridor METRES maps it")
+    yield Tile("sure", "How sure", "computed", "for small errors at constant speed and curvature; nothing is simulated")
 
 
 def _symbol(scenario: Scenario, axis: str) -> str:

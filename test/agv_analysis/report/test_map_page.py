@@ -30,6 +30,12 @@ def test_a_map_has_a_page_with_points_to_click(
     titles = of_plot(chromium, "n_bursts", "[plot._fullLayout.xaxis.title.text, plot._fullLayout.yaxis.title.text]")
     assert titles == ["sampling period T_s [s]", "gain K_x of the error along the track [1/s]"]
     data: Any = json.loads(chromium.execute_script("return document.getElementById('data').textContent"))
+    own = min(data["points"], key=lambda point: abs(point["kx"] - 25.0) + abs(point["ts"] - 0.005))
+    least = min(own["n_bursts"], own["n_lifted"])
+    assert f"{least} slots" in chromium.find_element("id", "word").text
+    stable = sum(point["ts"] * point["kx"] < 2.0 for point in data["points"])
+    assert f"{stable} of 441 points" in chromium.find_element("id", "stable").text
+    assert "--corridor" in chromium.find_element("id", "deviation").text
     for at in (100, 230, 440):  # row by row: 21 values of T_s for each K_x
         point = data["points"][at]
         chosen = f"{{x: {point['ts']!r}, y: {point['kx']!r}}}"
