@@ -652,6 +652,7 @@ def calm(sweep: Sweep) -> list[dict[str, Any]]:
         "instability_low": 0.0,
         "instability_high": 1.0,
         "unstable": 0,
+        "settles_without_losses": True,
         "runs": 1,
     }
     told |= {f"{metric}_{quantile}": 0.0 for metric in METRICS for quantile in ("p50", "p95")}
