@@ -543,7 +543,7 @@ def test_numbers_of_a_table_begin_anew_and_may_be_missing(tmp_path: Path) -> Non
     assert (far.packets, int(far.whole.lost.sum())) == (39996, 39994)
     flags = read(tmp_path / "c", "seq,lost\n1,0\n2,1\n5,0\n")
     assert flags.packets == 3
-    assert "numbers are missing in 1 places" in said(flags)
+    assert "numbers are missing in 1 place" in said(flags)
 
 
 @pytest.mark.parametrize("columns", ["frame.time_epoch,icmp.seq", "icmp.seq,frame.time_epoch,icmp.type"])
@@ -582,7 +582,7 @@ def test_a_table_of_what_a_receiver_got_shows_losses_by_its_numbers(tmp_path: Pa
 def test_a_table_that_names_its_losses_says_nothing_of_numbers_that_are_missing(tmp_path: Path) -> None:
     found = read(tmp_path / "a", "seq,sent,received\n0,1.0,1.1\n1,2.0,\n4,5.0,5.1\n")
     assert (found.packets, lost(found)) == (3, [1])
-    assert "numbers are missing in 1 places" in said(found)
+    assert "numbers are missing in 1 place" in said(found)
 
 
 def test_a_date_in_smaller_units_is_one_and_that_is_said(tmp_path: Path) -> None:
