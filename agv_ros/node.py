@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter as RosParameter
 from rclpy.signals import SignalHandlerOptions
 
 from agv_ros.codec import encode_diagnostics
+from agv_ros.counted import counted
 from agv_ros.endpoints import Output
 from agv_ros.errors import UserError
 from agv_ros.messages import CHANGED, PUBLISHED
@@ -319,7 +320,7 @@ class LoopNode(Node, Generic[P]):
         facts |= {f"errors {kind}": str(count) for kind, count in sorted(self.survived.items())}
         if self._ended:
             facts |= {ENDED: "true"}
-        message = f"{total} messages rejected" if total else "ok"
+        message = f"{counted(total, 'message')} rejected" if total else "ok"
         name = self.get_fully_qualified_name().lstrip("/")
         stamp_ns = min(max(0, stamp_ns), LATEST_NS)
         self._diagnostics.publish(encode_diagnostics(stamp_ns, int(total > 0), name, message, facts))

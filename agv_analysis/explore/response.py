@@ -23,6 +23,7 @@ from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.criteria.criterion import RunFacts
+from agv_ros.counted import counted
 from agv_ros.parameters import SHARED
 
 MOST_POINTS = 1200
@@ -68,7 +69,7 @@ def _badge(run: Run, strays: Deviation) -> dict[str, str]:
         "deviation": metres(strays.largest),
         "when": strays.reason if worst is None else f"at {worst.seconds:g} s",
         "losses": f"{100.0 * float(run.lost.mean()):.3g} %",
-        "outage": f"longest outage {longest} slots ({longest * run.ts * 1e3:g} ms)",
+        "outage": f"longest outage {counted(longest, 'slot')} ({longest * run.ts * 1e3:g} ms)",
     }
 
 
@@ -112,7 +113,7 @@ def summary_rows(run: Run, strays: Deviation | None = None) -> Iterator[tuple[st
     late = float(e[-max(1, len(e) // 10) :].max())
     yield "Error in the last tenth", "; ".join((at_most(late), *run.notes))
     yield "Deviation", deviation_sizes(strays or deviation(run, convergence(run).initial))
-    yield "Oldest pose", f"{facts.n} steps ({facts.n * run.ts * 1e3:g} ms)"
+    yield "Oldest pose", f"{counted(facts.n, 'step')} ({facts.n * run.ts * 1e3:g} ms)"
     if not facts.is_feasible:
         yield "Without losses", facts.infeasible
         return
@@ -133,4 +134,4 @@ def _rough_outage(run: Run, widths: Widths) -> str:
         return f"any up to {LONGEST} slots, from {FEW_PLACES} places of the lap"
     if n < 0:
         return "none: the AGV is outside without any"
-    return f"about {n} slots ({n * run.ts * 1e3:g} ms), from {FEW_PLACES} places of the lap"
+    return f"about {counted(n, 'slot')} ({n * run.ts * 1e3:g} ms), from {FEW_PLACES} places of the lap"

@@ -262,7 +262,8 @@ def _sentences(run: Run, timing: Timing, said: Deadlines | None) -> Iterator[str
             "its command"
         )
     if said is not None and said.stops:
-        yield f"the AGV stopped {said.stops} times because its newest command was older than plant.cmd_vel_timeout"
+        times = counted(said.stops, "time")
+        yield f"the AGV stopped {times} because its newest command was older than plant.cmd_vel_timeout"
     if said is not None and said.missed_edge_steps:
         yield f"the edge missed {said.missed_edge_steps} of its steps"
     if timing.is_late:

@@ -28,6 +28,7 @@ from agv_analysis.runtime.parameters import RecorderParameters
 from agv_analysis.scenario import load_scenario, metadata_of
 from agv_analysis.version import version
 from agv_ros.codec import stamp_of
+from agv_ros.counted import counted
 from agv_ros.executor import run_node
 from agv_ros.messages import PUBLISHED
 from agv_ros.node import ENDED, LoopNode
@@ -304,7 +305,7 @@ class RecorderNode(LoopNode[RecorderParameters]):
     def close(self) -> None:
         """Finish the bag and say what is in it."""
         if self._broken:
-            self.failure = self._broken + f"; {self._unwritten} messages came later" * (self._unwritten > 0)
+            self.failure = self._broken + f"; {counted(self._unwritten, 'message')} came later" * (self._unwritten > 0)
             return
         missing = self.missing()
         try:

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from agv_cloud.reference.point import ReferencePoint
 from agv_plant.vehicle.unicycle import arc_step
+from agv_ros.counted import counted
 
 Point = tuple[float, float]
 
@@ -50,7 +51,8 @@ class Curve:
         corners = _distinct(points)
         if len(corners) < 2:
             raise PathError(
-                f"it has {len(points)} points, of which {len(corners)} are distinct: 2 are needed for a path"
+                f"it has {counted(len(points), 'point')}, of which {counted(len(corners), 'is', 'are')} distinct: "
+                "2 are needed for a path"
             )
         self._pieces: list[_Piece] = []
         self.length = 0.0

@@ -128,7 +128,7 @@ def _times(values: dict[str, NDArray[Any]], options: Options) -> tuple[Floats, s
         unknown = np.isnan(values[role])
         if not unknown.all():
             k = np.arange(len(unknown), dtype=np.float64)
-            said = f"{int(np.count_nonzero(unknown))} times were interpolated"
+            said = f"{counted(int(np.count_nonzero(unknown)), 'time was', 'times were')} interpolated"
             return np.interp(k, k[~unknown], values[role][~unknown]), said
     count = len(next(iter(values.values())))
     number = values["seq"] - values["seq"][0] if "seq" in values else np.arange(count, dtype=np.float64)

@@ -180,7 +180,7 @@ def test_messages_that_come_twice_count_once_and_are_mentioned(tmp_path: Path) -
     run = read_run(changed_bag(tmp_path / "bag.mcap", lambda topic, k, data: [data] * (1 + (k == 5))))
     assert len(run) == 2000
     assert not run.unexplained
-    assert any("/agv/pose: 1 messages repeat a step" in note for note in run.notes)
+    assert any("/agv/pose: 1 message repeats a step" in note for note in run.notes)
 
 
 def test_messages_off_the_grid_are_mentioned(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_messages_off_the_grid_are_mentioned(tmp_path: Path) -> None:
         return [data[:4] + struct.pack("<iI", sec, nanosec + 1) + data[12:]]
 
     run = read_run(changed_bag(tmp_path / "bag.mcap", shift))
-    assert any("/edge/cmd_vel: 1 messages are no sampling instant's" in note for note in run.notes)
+    assert any("/edge/cmd_vel: 1 message is no sampling instant's" in note for note in run.notes)
     assert np.isnan(run.command[10]).all()
     assert run.unexplained == {"edge/cmd_vel": 1}
 

@@ -111,8 +111,8 @@ def test_the_way_back_is_begun_by_a_turn_on_the_spot() -> None:
     ("path", "reason"),
     [
         ([], "0 points, of which 0 are distinct"),
-        ([(1.0, 2.0)], "1 points, of which 1 are distinct"),
-        ([(1.0, 2.0)] * 5, "5 points, of which 1 are distinct"),
+        ([(1.0, 2.0)], "1 point, of which 1 is distinct"),
+        ([(1.0, 2.0)] * 5, "5 points, of which 1 is distinct"),
         ([(0.0, 0.0), (math.nan, 0.0), (1.0, 0.0)], r"point \(nan, 0.0\) is not finite"),
         ([(0.0, 0.0), (1.0, -math.inf)], r"point \(1.0, -inf\) is not finite"),
         ([(-1e308, 0.0), (1e308, 0.0)], "length is not finite"),
