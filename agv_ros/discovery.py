@@ -15,12 +15,10 @@ DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _STATIC_PEERS = "ROS_STATIC_PEERS"
 """Environment variable of ROS 2: hosts that are found beyond that range."""
 
-_PROFILES = {
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("fastdds_2.xml")),
-    "FASTDDS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("fastdds_3.xml")),
-}
-"""Our profiles by the environment variable of Fast DDS up to version 2 and from version 3 on, whose words for the same
-differ. Other middlewares ignore them."""
+_PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+"""Environment variables of Fast DDS, up to version 2 and from version 3 on. Other middlewares ignore them."""
+
+_LOOPBACK = str(Path(__file__).with_name("loopback.xml"))
 
 
 def limit_to_this_host(environment: MutableMapping[str, str]) -> None:
@@ -30,12 +28,12 @@ def limit_to_this_host(environment: MutableMapping[str, str]) -> None:
     a process with another range, do not.
     """
     environment.setdefault(DISCOVERY_RANGE, "LOCALHOST")
-    others = {name for name, ours in _PROFILES.items() if environment.get(name, ours) != ours}
+    others = {name for name in _PROFILES if environment.get(name, _LOOPBACK) != _LOOPBACK}
     is_local = environment[DISCOVERY_RANGE] in ("LOCALHOST", "OFF") and not environment.get(_STATIC_PEERS)
-    for name, ours in _PROFILES.items():
+    for name in _PROFILES:
         if is_local and not others:
-            environment[name] = ours
-        elif environment.get(name) == ours:
+            environment[name] = _LOOPBACK
+        elif environment.get(name) == _LOOPBACK:
             del environment[name]
 
 

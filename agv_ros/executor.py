@@ -37,9 +37,6 @@ _ROSOUT_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _ROSOUT_PATIENCE = 3.2
 """How long [s] a process that fails looks for those who watch /rosout: DDS finds some only when it repeats itself."""
 
-_KNOWN_TO_BOTH = 0.5
-"""A subscriber learns of its publisher at most so much later [s] than that of it; what came before is none of its."""
-
 LAST_FLUSH_TIMEOUT = 10.0
 """How long [s] a node that finishes normally waits for subscribers that lag."""
 
@@ -125,7 +122,6 @@ def _say_on_rosout(name: str, failure: str, stop: Stop) -> None:
     deadline = time.monotonic() + _ROSOUT_PATIENCE
     while not (publisher.get_subscription_count() or stop.requested) and time.monotonic() < deadline:
         time.sleep(0.01)
-    time.sleep(_KNOWN_TO_BOTH)
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     stamp = TimeMessage(sec=seconds, nanosec=nanoseconds)
     publisher.publish(Log(stamp=stamp, level=Log.FATAL, name=name, msg=failure))

@@ -38,7 +38,7 @@ BUSY = 1.0
 """Where processes have waited for a processor for longer than this [s], shortly before the signal and after it, ..."""
 
 REPAIRS = 2 * 3.0
-"""... DDS may have lost what it says of who is there, on its way to one that was late; it says so again every 3 s."""
+"""... DDS may have lost messages on their way to a reader that was late; it says only every 3 s that there are some."""
 
 LAG = 2.0
 """How long [s] before the signal a lack of processors may be why the recorder is behind."""

@@ -20,8 +20,7 @@ from agv_ros.stamps import LATEST_NS, NS_PER_S
 PATIENCE = 15.0
 """How long [s] a run that is interrupted waits for its recorder, if there is one that lags: nothing shall be lost.
 
-Without our profile, which is for one host, Fast DDS says only every 3 s that a message is there which a busy reader
-has missed.
+DDS says only every 3 s that a message is there which a busy reader has missed.
 """
 
 

@@ -263,10 +263,10 @@ def test_a_type_that_is_not_installed_is_said_once_and_the_rest_crosses(
 ) -> None:
     whole = importlib.import_module
 
-    def without_sensors(name: str) -> Any:
+    def without_sensors(name: str, package: str | None = None) -> Any:
         if name == "sensor_msgs.msg":
             raise ImportError(name)
-        return whole(name)
+        return whole(name, package)
 
     made = radio(uplink__topics=["/scan", "/odom"])
     diagnostics: list[Any] = []
