@@ -265,8 +265,8 @@ def _push(
     """
     count, longest, sides = directions.shape[0], window.shape[0] - 1, directions.shape[0] - 2
     half, per_sine, per_lever = sides // 2, 1.0 / math.sin(2.0 * math.pi / sides), 1.0 / lever
-    y_of, t_of = directions[2:, 1].copy(), directions[2:, 2].copy()
-    c_y, c_t = directions[2:, 1].copy(), directions[2:, 2] / lever
+    c_y, t_of = directions[2:, 1].copy(), directions[2:, 2].copy()
+    c_t = t_of / lever
     of_y, of_t = np.empty(sides), np.empty(sides)
     sectors = np.zeros(half, dtype=np.int64)
     for j in range(bounds.shape[0]):
@@ -304,7 +304,7 @@ def _push(
                     p_x, p_y, p_t = M[0], M[1], M[2] * per_lever
                     pushed, unknown, side, one, other = b_x, r_x, sectors[0], 0, 1
                 else:  # of the polygon
-                    y, theta = y_of[i], t_of[i]
+                    y, theta = c_y[i], t_of[i]
                     p_x, p_y = M[3] * y + M[6] * theta, M[4] * y + M[7] * theta
                     p_t = (M[5] * y + M[8] * theta) * per_lever
                     pushed, unknown = b_y * y + b_t * theta, r_y * abs(y) + r_t * abs(theta)

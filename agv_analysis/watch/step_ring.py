@@ -53,9 +53,3 @@ class StepRing:
         values = self._values[k % self._capacity, _PLACE[column]]
         known = (self._steps[k % self._capacity] == k) & ~np.isnan(values)
         return k[known], values[known]
-
-
-def column(rows: Floats, name: str) -> Floats:
-    """A column of the rows of a StepRing, shape (N,)."""
-    found: Floats = rows[:, _PLACE[name]]
-    return found

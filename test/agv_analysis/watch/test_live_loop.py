@@ -20,7 +20,7 @@ from agv_analysis.watch.live_loop import FAR, POINTS, TOPICS, LiveLoop
 from agv_analysis.watch.live_tiles import live_tiles, metres
 from agv_analysis.watch.message_log import Heard, MessageLog
 from agv_analysis.watch.outage_order import with_outage
-from agv_analysis.watch.step_ring import StepRing, column
+from agv_analysis.watch.step_ring import COLUMNS, StepRing
 from agv_plant.parameters import ChannelParameters
 from agv_plant.radio.channel import losses
 from agv_ros.codec import encode_command, encode_error, encode_pose, encode_slot
@@ -206,8 +206,9 @@ def test_a_ring_forgets_steps_that_are_too_old() -> None:
     for k in range(12):
         ring.put(k, "x", float(k), -1.0, 0.0)
     ring.put(3, "x", 99.0, 0.0, 0.0)
-    assert column(ring.rows(2, 13), "x")[2:10].tolist() == list(range(4, 12))
-    assert np.isnan(column(ring.rows(2, 13), "x")[[0, 1, 10]]).all()
+    x = ring.rows(2, 13)[:, COLUMNS.index("x")]
+    assert x[2:10].tolist() == list(range(4, 12))
+    assert np.isnan(x[[0, 1, 10]]).all()
 
 
 def test_sliders_are_those_of_the_law_and_of_the_channel() -> None:
