@@ -21,7 +21,6 @@ from agv_analysis.bags.mcap_file import McapFile
 from agv_analysis.bags.packed_files import is_packed, refuse_archive, unpack
 from agv_analysis.bags.records import MAGIC as MCAP
 from agv_analysis.bags.storage import Storage
-from agv_ros.counted import counted
 from agv_ros.errors import refuse_irregular
 
 METADATA = "metadata.yaml"
@@ -138,9 +137,7 @@ def _bag_of_file(path: Path) -> Contents:
             if path.name in listed:
                 contents = _by_metadata(path.parent)
                 if len(listed) > 1:
-                    contents.findings.add(
-                        f"{path.name} is one of {counted(len(listed), 'file')} of a split bag, all of them read"
-                    )
+                    contents.findings.add(f"{path.name} is one of {len(listed)} files of a split bag, all of them read")
                 return contents
     contents = Contents([path])
     parts = [file.name for file in _files_in(path.parent) if file != path and _family(file) == _family(path)]

@@ -149,7 +149,7 @@ class Margins:
             said = "any number" if self.n_paper is None else str(self.n_paper)
             found.append(
                 f"the paper's test allows {said} lost updates in a row; a pose that is always "
-                f"{_steps(self.n_lifted + 1)} old makes the error grow"
+                f"{counted(self.n_lifted + 1, 'step')} old makes the error grow"
             )
         if self.n_paper is not None and self.n_bursts is not None and self.n_paper < self.n_bursts:
             found.append(
@@ -161,7 +161,7 @@ class Margins:
             found.append(
                 f"outages of up to {counted(self.n_bursts, 'slot')} are survived, since a fresh pose follows "
                 "each; a pose that is "
-                f"always {_steps(self.n_lifted + 1)} old is not"
+                f"always {counted(self.n_lifted + 1, 'step')} old is not"
             )
         p_square, p_sure = self.p_mean_square, self.p_almost_sure
         if p_square is not None and p_sure is not None and p_sure > p_square:
@@ -220,10 +220,6 @@ class Margins:
             "disagreements": self.disagreements(),
             **self._twins_to_json(),
         }
-
-
-def _steps(n: int) -> str:
-    return counted(n, "step")
 
 
 def margins(scenario: Scenario) -> Margins:

@@ -16,7 +16,6 @@ from agv_analysis.link.formats.text_columns import head_of
 from agv_analysis.link.measurement import MeasurementError, Setting
 from agv_analysis.link.netem_text import is_netem, read_netem
 from agv_plant.parameters import ChannelParameters
-from agv_ros.counted import counted
 from agv_ros.json_text import parse_json
 
 
@@ -71,8 +70,7 @@ def _read(path: Path, options: Options) -> Setting:
     if len(lines) > 1:
         devices = ", ".join(_device(line) or "no device" for line in lines)
         raise MeasurementError(
-            f"{path}: has {counted(len(lines), 'line')} for netem, which are one link each ({devices}): leave one "
-            "of them"
+            f"{path}: has {len(lines)} lines for netem, which are one link each ({devices}): leave one of them"
         )
     found = setting(lines[0], str(path))
     return replace(found, differences=(*found.differences, *_others(head, _device(lines[0]))))
