@@ -25,7 +25,7 @@ from agv_ros.discovery import discovery_note
 from agv_ros.errors import UserError, open_text
 from agv_ros.node import LoopNode
 from agv_ros.service_manager import ALIVE, READY, STOPPING, notify, watchdog_period
-from agv_ros.stopping import ENDS_WITH_STDIN, Stop, stop_on_signals
+from agv_ros.stopping import CLOSED, ENDS_WITH_STDIN, Stop, stop_on_signals
 
 EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "single": SingleThreadedExecutor}
 
@@ -148,6 +148,7 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     deadline = time.monotonic() + (node.settings.stop_timeout if stop.requested else LAST_FLUSH_TIMEOUT)
     spin_for(executor, lambda: stop.insisted or node.is_settled(), deadline - time.monotonic())
     node.close()
+    node.get_logger().info(f"{CLOSED}, waits until all that it has published has arrived")
     node.flush(max(0.0, deadline - time.monotonic()), lambda: stop.insisted)
     executor.shutdown()
     node.destroy_node()

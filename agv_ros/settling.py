@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-_QUIET = 0.02
+_QUIET = 0.1
 """Nothing is under way any more when nothing has come for so long [s]."""
 
 

@@ -12,6 +12,9 @@ from contextlib import contextmanager
 STOPPED_BY = "stopped by "
 """Begins the line that a node logs when it is asked to end before it has done its work."""
 
+CLOSED = "closed"
+"""Begins the line that a node logs when it has published its last message, and only waits until that has arrived."""
+
 ENDS_WITH_STDIN = "AGV_NCS_ENDS_WITH_STDIN"
 """Environment variable: a process in which it is set ends when its standard input does.
 

@@ -28,7 +28,7 @@ from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.progress_line import progress_line, progress_of
 from agv_ros.errors import UserError
 from agv_ros.parameters import as_dict
-from agv_ros.stopping import ENDS_WITH_STDIN, STOPPED_BY, Stop, stop_on_signals
+from agv_ros.stopping import CLOSED, ENDS_WITH_STDIN, STOPPED_BY, Stop, stop_on_signals
 
 _STOP_TIMEOUT = 20.0
 """How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
@@ -105,19 +105,28 @@ def _failure(plant: _Process, ended: Sequence[_Process], halted: Sequence[_Proce
 def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float, in_order: bool = False) -> None:
     """End all nodes, the recorder, which has to hear of the others' end, last.
 
-    `in_order`: one after the other as in the loop, so that each answers what the one before it has sent.
+    `in_order`: one after the other as in the loop, so that each answers what the one before it has sent. The next one's
+    turn comes when a node has published its last message. Until that has arrived, all wait side by side: DDS asks for
+    an answer every 3 s only.
     """
-    loop = [nodes[name] for name in SCHEMAS if name in nodes]
-    for together in [[node] for node in loop] if in_order else [loop]:
-        _end_all(together, stop, patience)
-    _end_all([nodes[name] for name in nodes if name not in SCHEMAS], stop, patience)
+    loop, others = [nodes[name] for name in SCHEMAS if name in nodes], [nodes[n] for n in nodes if n not in SCHEMAS]
+    if not in_order:
+        _end_all(loop, stop, patience)
+        _end_all(others, stop, patience)
+        return
+    for node in (*loop, *others):
+        node.ask_to_end()
+        deadline = time.monotonic() + patience
+        while node.is_open(_LOOK_PERIOD / 10) and not stop.insisted and time.monotonic() < deadline:
+            pass
+    _end_all([*loop, *others], stop, patience)
 
 
 def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None:
     """Ask processes to end; after `patience` [s], or as soon as it is insisted on, to hurry; then kill them."""
-    for timeout in (patience, _HURRY_TIMEOUT):
+    for timeout, ask in ((patience, _Process.ask_to_end), (_HURRY_TIMEOUT, _Process.hurry)):
         for process in processes:
-            process.send_signal(signal.SIGINT)
+            ask(process)
         deadline = time.monotonic() + timeout
         while any(process.is_running(_LOOK_PERIOD / 10) for process in processes) and time.monotonic() < deadline:
             if stop.insisted and timeout == patience:
@@ -205,6 +214,8 @@ class _Process:
         self.pace = Speedometer()
         self.stopped = ""
         """What it said when it was asked to end before it had done its work."""
+        self._has_closed = False
+        self._was_asked = False
         self._lines: list[str] = []
         domain = {"ROS_DOMAIN_ID": str(domain_id)} if domain_id >= 0 else {}
         # A session of its own: Ctrl-C reaches the runner alone, which then ends the nodes in order. However the runner
@@ -226,7 +237,9 @@ class _Process:
                 self.pace.see(steps)
             if text.startswith(STOPPED_BY):
                 self.stopped = text
-            if steps is None or not text.startswith("step "):  # else it says no more than that
+            if text.startswith(CLOSED):
+                self._has_closed = True
+            elif steps is None or not text.startswith("step "):  # else it says no more than that
                 self._lines.append(text)
 
     @property
@@ -243,8 +256,12 @@ class _Process:
         return False
 
     def is_ending(self) -> bool:
-        """Has it ended, or has it been asked to?"""
-        return bool(self.stopped) or not self.is_running()
+        """Has it ended, has it published its last message, or has it been asked to end?"""
+        return bool(self.stopped) or not self.is_open()
+
+    def is_open(self, wait: float = 0.0) -> bool:
+        """May it still publish after `wait` [s]?"""
+        return self.is_running(wait) and not self._has_closed
 
     def is_halted(self) -> bool:
         """Has a signal, as SIGSTOP, halted it?"""
@@ -267,10 +284,16 @@ class _Process:
             return f"{self.name} was ended by {self.killed_by}"
         return self._lines[-1] if self._lines else f"exit status {self.status}, without any output"
 
-    def send_signal(self, number: signal.Signals) -> None:
-        """Send it a signal, unless it has ended; one that is halted goes on for it."""
+    def ask_to_end(self) -> None:
+        """Ask it to end in order, once, unless it does already."""
+        if not self._was_asked and self.is_open():
+            self._was_asked = True
+            self.hurry()
+
+    def hurry(self) -> None:
+        """Ask it to end, or, if it was asked before, to wait for nothing. One that is halted goes on for it."""
         if self.is_running():
-            self._process.send_signal(number)
+            self._process.send_signal(signal.SIGINT)
             self._process.send_signal(signal.SIGCONT)
 
     def collect(self) -> None:

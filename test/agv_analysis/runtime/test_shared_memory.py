@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -110,7 +109,6 @@ def test_a_port_that_was_made_a_moment_ago_goes_with_the_run_whose_node_was_kill
     """Who still sent to that node made it anew."""
     node = _Process("node", [sys.executable, "-c", "import time; time.sleep(60)"])
     port = SHARED_MEMORY / f"fastrtps_port_of_test_{os.getpid()}"
-    node.send_signal(signal.SIGKILL)
     try:
         node.collect()
         port.write_bytes(b"ring")
