@@ -22,7 +22,8 @@ from rich.table import Table
 
 from agv_analysis.compiled.functions import compiled
 from agv_analysis.corridor.lap_loop import LapLoop, Outcomes
-from agv_analysis.corridor.outer_tube import Tube, outer_tube, with_remainder
+from agv_analysis.corridor.outer_tube import Tube, outer_tube
+from agv_analysis.corridor.second_order import nonlinear_tube
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.run import Floats
 from agv_analysis.scenario import load_scenario
@@ -70,14 +71,14 @@ class Search:
         self._loop = LapLoop(scenario, Widths(_HALF_WIDTH, math.inf, math.inf))
         linear = loop_on_lap(scenario)
         tube = outer_tube(self._loop, linear, n)
-        covering = None if tube is None else with_remainder(self._loop, linear, tube)
-        if covering is None:
-            raise click.ClickException(f"{policy} on {track}: no tube for outages of {n} slots covers the second order")
-        self.tube: Tube = covering
-        """The one that covers what is of second order."""
+        found = None if tube is None else nonlinear_tube(self._loop, linear, tube)
+        if found is None or not found.is_proved or found.tube.n < n:
+            raise click.ClickException(f"{policy} on {track}: no tube of the nonlinear loop for outages of {n} slots")
+        self.tube: Tube = found.tube
+        """The one that is proved for the nonlinear loop."""
         self._rng = rng
         self._best: Lengths = np.full(_SLOTS, n)
-        self.case = Case(policy, track, n, covering.deviation)
+        self.case = Case(policy, track, n, self.tube.deviation)
 
     def go_on(self) -> None:
         """One more sequence, from all places."""

@@ -11,8 +11,9 @@ from agv_analysis.corridor import outer_tube as tubes
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.leaving import Leaving, chain_alone, is_random, leaving
 from agv_analysis.corridor.outage_sequences import WorstSequence, largest_n
-from agv_analysis.corridor.outer_tube import Tube, applies_to, with_remainder
+from agv_analysis.corridor.outer_tube import Tube, applies_to
 from agv_analysis.corridor.rms_deviation import RmsDeviation, rms_deviation
+from agv_analysis.corridor.second_order import NonlinearTube, nonlinear_tube
 from agv_analysis.corridor.single_outage import LONGEST, SingleOutage, roughly, single_outage
 from agv_analysis.corridor.stationary_deviation import StationaryDeviation, stationary_deviation
 from agv_analysis.corridor.widths import Widths, widths_of
@@ -59,12 +60,11 @@ class Corridor:
     """Largest n for which no sequence of outages of up to n slots was found that leaves; None: with all that were
     tried."""
     n_any_reason: str
-    n_any_proved: int | None
-    """Largest n for which a tube about the loss-free motion stays inside, whatever outages of up to n slots come: that
-    of the linear loop, see `outer_tube`; None: not computed, `tube_reason` says why."""
-    tube: Tube | None
-    covering: Tube | None
-    """As `tube`, with what is of second order covered as well; None where none was found that stays inside."""
+    linear_tube: Tube | None
+    """The tube of the linear loop for the largest n with which it stays inside, see `outer_tube`; None: there is none,
+    or it was not computed: `tube_reason` says why."""
+    nonlinear: NonlinearTube | None
+    """The tube of the nonlinear loop, see `second_order`; None where none was found that stays inside."""
     tube_reason: str
     stationary: StationaryDeviation | None
     """Stationary deviation of the linear loop, by its second moments; None: not computed, `rms.reason` says why."""
@@ -82,6 +82,21 @@ class Corridor:
         None: it did with all that were tried, or nothing is known.
         """
         return None if self.single is None else self.single.n
+
+    @property
+    def tube(self) -> Tube | None:
+        """The tube of the nonlinear loop where it is proved, else that of the linear one."""
+        return proving(self.linear_tube, self.nonlinear)
+
+    @property
+    def n_any_proved(self) -> int | None:
+        """Largest n for which that tube stays inside, whatever outages of up to n slots come.
+
+        -1: not even without outages; None: not computed, `tube_reason` says why.
+        """
+        if self.tube is not None:
+            return self.tube.n
+        return None if self.tube_reason or self.single is None else -1
 
     @property
     def in_short(self) -> str:
@@ -122,13 +137,16 @@ class Corridor:
         return f"no sequence found that leaves up to {counted(self.n_any, 'slot')}; {self.n_any_reason}"
 
     def _proved(self) -> str:
-        n = self.n_any_proved
-        if self.tube is None or n is None:
-            return f"no n ({self.tube_reason})" if n is None else "not even without outages"
-        off = f"at most {self.tube.deviation:.3g} m off, by the linear loop"
-        if self.covering is not None:
-            return f"{counted(n, 'slot')}: {off}, {self.covering.deviation:.3g} m with what is of second order"
-        return f"{counted(n, 'slot')}: {off}; what is of second order could not be covered"
+        linear, nonlinear = self.linear_tube, self.nonlinear
+        if linear is None:
+            return f"no n ({self.tube_reason})" if self.tube_reason else "not even without outages"
+        by_linear = f"{counted(linear.n, 'slot')} by the linear loop, at most {linear.deviation:.3g} m off"
+        if nonlinear is None:
+            return f"{by_linear}; what is of second order could not be covered"
+        covering = f"{counted(nonlinear.tube.n, 'slot')}, at most {nonlinear.tube.deviation:.3g} m off"
+        if nonlinear.is_proved:
+            return covering
+        return f"{by_linear}; with what is of second order, which was measured, {covering}"
 
     def _probability(self) -> str:
         lap, hour = self.leaving.p_lap, self.leaving.p_hour
@@ -154,7 +172,9 @@ class Corridor:
             "n_any_proved": self.n_any_proved,
             "n_any_proved_reason": self.tube_reason or None,
             "tube_deviation": None if self.tube is None else self.tube.deviation,
-            "tube_deviation_second_order": None if self.covering is None else self.covering.deviation,
+            "n_any_linear": None if self.linear_tube is None else self.linear_tube.n,
+            "n_any_proved_of": self._proved_of(),
+            "tube_deviation_second_order": None if self.nonlinear is None else self.nonlinear.tube.deviation,
             **self.rms.to_json(),
             "rms_along": None if self.stationary is None else finite(self.stationary.rms_along),
             "rms_across": None if self.stationary is None else finite(self.stationary.rms_across),
@@ -165,6 +185,11 @@ class Corridor:
             "laps": len(found.largest),
             "notes": list(self.notes),
         }  # fmt: skip
+
+    def _proved_of(self) -> str | None:
+        if self.tube is None:
+            return None
+        return "the linear loop" if self.tube is self.linear_tube else "the nonlinear loop"
 
     def _why_no_single(self) -> str | None:
         if self.single is None:
@@ -185,7 +210,7 @@ def corridor(
     if widths is None:
         return None
     loop, single, sequence, n_any, why, reason = LapLoop(scenario, widths), None, None, None, "", ""
-    n_proved, tube, covering, why_no_tube = None, None, None, "" if proved else _NOT_ASKED
+    tube, nonlinear, why_no_tube = None, None, "" if proved else _NOT_ASKED
     if not (scenario.relay.uplink.is_direct and scenario.relay.downlink.is_direct):
         reason = NOT_ALONE
     elif not loop.loss_free_share < _DIVERGED:
@@ -197,17 +222,18 @@ def corridor(
         n_any, sequence, why = _any_outages(loop, single)
         if proved:
             progress("a tube for any outages")
-            n_proved, tube, covering, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
+            tube, nonlinear, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
     progress("laps")
     # Noise and slip are not part of what is proved.
-    covered = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else n_proved
-    found = leaving(loop, single, laps, lambda done: progress(counted(done, "lap")), covered)
+    covering = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else proving(tube, nonlinear)
+    n_proved = None if covering is None else covering.n
+    found = leaving(loop, single, laps, lambda done: progress(counted(done, "lap")), n_proved)
     progress("the RMS deviation")
     stationary, why_not = _stationary(loop)
     rms = rms_deviation(loop, chain_alone(scenario), stationary, why_not, found)
     return Corridor(
-        widths, loop.ts, single, sequence, n_any, why, n_proved, tube, covering, why_no_tube, stationary, rms,
-        found, loop.lap, reason, (*_notes(loop, single), *rms.notes()),
+        widths, loop.ts, single, sequence, n_any, why, tube, nonlinear, why_no_tube, stationary, rms, found, loop.lap,
+        reason, (*_notes(loop, single), *rms.notes()),
     )  # fmt: skip
 
 
@@ -222,7 +248,7 @@ def rough_tube(loop: LapLoop) -> tuple[Tube | None, str]:
     if not loop.loss_free_share < _DIVERGED:
         return None, f"no tube: {_NEVER_SETTLES}"
     n = roughly(loop)
-    _, tube, _, why = _tubes(loop, _LONGEST_ANY if n is None else min(n, _LONGEST_ANY), second_order=False)
+    tube, _, why = _tubes(loop, _LONGEST_ANY if n is None else min(n, _LONGEST_ANY), second_order=False)
     if tube is None:
         return None, f"no tube: {why or 'it is left without any outage'}"
     return tube, "of the linear loop"
@@ -253,18 +279,23 @@ def _longest_any(single: SingleOutage) -> int:
     return _LONGEST_ANY if single.n is None else min(single.n, _LONGEST_ANY)
 
 
-def _tubes(loop: LapLoop, longest: int, second_order: bool = True) -> tuple[int | None, Tube | None, Tube | None, str]:
-    """The largest n that is proved, its tube, that with the second order if asked for, and why there is none."""
+def proving(linear: Tube | None, nonlinear: NonlinearTube | None) -> Tube | None:
+    """The tube of the nonlinear loop where it is proved, else that of the linear one."""
+    return nonlinear.tube if nonlinear is not None and nonlinear.is_proved else linear
+
+
+def _tubes(loop: LapLoop, longest: int, second_order: bool = True) -> tuple[Tube | None, NonlinearTube | None, str]:
+    """The tubes of the linear loop and, if asked for, of the nonlinear one for the largest n; why there is none."""
     if loop.scenario.controller.steps_ahead:
-        return None, None, None, LOOKS_AHEAD
+        return None, None, LOOKS_AHEAD
     try:
         linear = loop.linear
     except NoNominalMotionError as error:
-        return None, None, None, str(error)
+        return None, None, str(error)
     if not applies_to(linear):
-        return None, None, None, "computed for loops without states beside the pose, on a track that is driven"
-    n, tube = tubes.largest_n(loop, linear, longest)
-    return n, tube, with_remainder(loop, linear, tube) if tube is not None and second_order else None, ""
+        return None, None, "computed for loops without states beside the pose, on a track that is driven"
+    _, tube = tubes.largest_n(loop, linear, longest)
+    return tube, nonlinear_tube(loop, linear, tube) if tube is not None and second_order else None, ""
 
 
 def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:

@@ -17,29 +17,26 @@ are no larger at its end than at its beginning hold forever; so do those of its 
 half ends with bounds that are no larger than those with which the other one begins.
 
 This proves the tube for the linear loop with the b_i of the nonlinear one. What is of second order, the `remainder`,
-can be added to each b_i as a box. Its size is measured on the nonlinear loop, from the corners of the very tube, at
-places of the lap, and times a factor: then it is covered, but not proved.
+can be added to each b_i as a box: see `second_order`.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from agv_analysis.compiled.functions import compiled
 from agv_analysis.corridor.biases import Biases, biases, neighbours
-from agv_analysis.corridor.lap_loop import LapLoop, outage
+from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.run import Floats
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.products import IDENTITY, times
-from agv_analysis.stability.reception_maps import burst_maps
 
 _SIDES, _SIDES_OF_LONG = 32, 16
 """Directions of the polygon, fewer for outages that are LONG; multiples of 4, so that those along y_e and theta_e are
@@ -51,7 +48,7 @@ LONG = 100
 _FARTHER = 3.0
 """Multiple of the corridor's width up to which a tube is followed, to know how much too wide it is."""
 
-_ERRORS = 3
+ERRORS = 3
 
 _WARM_UP = 4000
 """Steps after which what the tube was before is forgotten; at the end it is tested that it was."""
@@ -62,21 +59,9 @@ _SLACK = 1e-6
 _LAPS = 4
 """Laps after which a tube that still grows counts as one without an end."""
 
-_PARTS = 100
-"""Parts of the lap, of each of which the remainder is measured where it begins."""
-
-_ROUNDS, _MORE = 12, 1.1
-"""How often the tube is widened by the remainder that it has, and by how much more than that."""
-
 _APART, _BELOW = 5, 0.988
 """Steps between receptions, at most, of a first look at outages that are LONG; share of the n found with which the tube
 of all is tried, which is wider by a hundredth or two."""
-
-_ROUNDING = 1e-9
-"""Remainder that is none [m, m, rad]."""
-
-_REMAINDER_TIMES = 1.2
-"""Factor on the largest remainder that was measured."""
 
 
 class Template(NamedTuple):
@@ -103,8 +88,6 @@ class Tube:
     template: Template
     nominal: Floats
     """Errors of the loss-free motion, shape (R, 3)."""
-    remainder: Floats
-    """Boxes that are added to the b_i, by part of the lap, shape (parts, n + 2, 3)."""
     share: Floats
     """Share of the corridor that the tube uses at most, by step, shape (R,)."""
     distance: Floats
@@ -135,7 +118,7 @@ def template_of(linear: LinearLoop, sides: int = _SIDES) -> Template:
 
 def applies_to(linear: LinearLoop) -> bool:
     """Are the errors all the states of the loop?"""
-    return linear.size == linear.outputs == _ERRORS
+    return linear.size == linear.outputs == ERRORS
 
 
 def outer_tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases | None = None, apart: int = 1) -> Tube | None:
@@ -145,7 +128,7 @@ def outer_tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases | None = 
     than of all, and bounds those steps alone.
     """
     bias = biases(loop, linear, n) if bias is None else bias.up_to(n)
-    return _tube(loop, linear, n, bias, np.zeros((1, n + 2, _ERRORS)), apart)
+    return tube_with(loop, linear, n, bias, np.zeros((1, n + 2, ERRORS)), apart)
 
 
 def largest_n(loop: LapLoop, linear: LinearLoop, longest: int) -> tuple[int, Tube | None]:
@@ -188,8 +171,7 @@ def _bracket(
     inside, tube = -1, None
     while outside - inside > max(1, inside // part if inside > LONG else 0):
         found = tube_of(attempt)
-        # How far outages lead grows with their length behind a predictor, with its square where a pose is held.
-        expected = 0.0 if found is None else attempt / found.largest_share ** (1.0 if predicts else 0.5)
+        expected = 0.0 if found is None else shorter(attempt, found.largest_share, predicts)
         if found is not None and found.largest_share <= 1.0:
             inside, tube = attempt, found
             wanted = max(int(expected), inside + inside // part) if inside > LONG else 0
@@ -200,26 +182,18 @@ def _bracket(
     return inside, outside, tube
 
 
-def with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube) -> Tube | None:
-    """A tube that covers, too, what is of second order in it; None where none was found that stays in the corridor."""
-    if tube.n > LONG:
-        return None
-    bias, parts = biases(loop, linear, tube.n), 1 if linear.is_constant else min(_PARTS, loop.steps)
-    remainder = np.zeros((parts, tube.n + 2, _ERRORS))
-    found: Tube | None = replace(tube, remainder=remainder)
-    for _ in range(_ROUNDS):
-        if found is None or found.largest_share > 1.0:
-            return None
-        needed = _REMAINDER_TIMES * measured_remainder(loop, linear, found, bias)
-        if (needed <= remainder + _ROUNDING).all():
-            return found
-        remainder = np.maximum(remainder, _MORE * needed)
-        found = _tube(loop, linear, tube.n, bias, remainder)
-    return None
+def shorter(n: int, share: float, predicts: bool) -> float:
+    """The n whose tube uses all of the corridor, by that share of it which another one's uses.
+
+    How far outages lead grows with their length behind a predictor, with its square where a pose is held.
+    """
+    return float(n / share ** (1.0 if predicts else 0.5))
 
 
-def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Floats, apart: int = 1) -> Tube | None:
-    """As `outer_tube`, with a given remainder."""
+def tube_with(
+    loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Floats, apart: int = 1
+) -> Tube | None:
+    """As `outer_tube`, with boxes that are added to the b_i, by part of the lap: shape (parts, n + 2, 3)."""
     if not np.isfinite(bias.rows).all():
         return None
     rows, template = len(bias.nominal), template_of(linear, _SIDES_OF_LONG if n > LONG else _SIDES)
@@ -250,7 +224,7 @@ def _tube(loop: LapLoop, linear: LinearLoop, n: int, bias: Biases, remainder: Fl
             if (windows <= before).all():
                 of_rows = bounds.reshape(-1, rows, bounds.shape[1]).max(axis=0)[::apart]
                 nominal = bias.nominal[::apart]
-                return Tube(n, of_rows, template, nominal, remainder, *_extent(of_rows, template, nominal, widths))
+                return Tube(n, of_rows, template, nominal, *_extent(of_rows, template, nominal, widths))
     return None
 
 
@@ -343,35 +317,3 @@ def _extent(bounds: Floats, template: Template, nominal: Floats, widths: Widths)
     along, across = x + turned * y, y + turned * x  # the errors are seen from the AGV, the corridor from its reference
     distance = np.hypot(x, y)
     return np.maximum(distance / widths.distance, np.maximum(along / widths.along, across / widths.across)), distance
-
-
-def measured_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Biases) -> Floats:
-    """Largest difference of the nonlinear loop from M_i z + b_i, from the corners of a tube, by part of the lap.
-
-    Shape (parts, n + 2, 3). Of each part it is measured from where it begins, and holds for it and the one before.
-    """
-    parts, length, quarter = len(tube.remainder), tube.n + 2, tube.template.quarter
-    every = -(-loop.steps // parts)
-    steps = np.arange(0, loop.steps, every)
-    widest = np.maximum.reduceat(tube.bounds, np.unique(steps * len(tube.bounds) // loop.steps))
-    widest = np.broadcast_to(widest, (len(steps), widest.shape[1]))
-    pairs = (0, 1, 1.0), (2, 2 + 2 * quarter, 1.0), (2 + quarter, 2 + 3 * quarter, tube.template.lever)
-    ahead, left, turned = (np.stack((widest[:, one], -widest[:, other])) / unit for one, other, unit in pairs)
-    identity = np.broadcast_to(np.eye(_ERRORS), (len(steps), _ERRORS, _ERRORS))
-    maps = np.stack((identity, *burst_maps(linear, length - 1, steps % len(linear.F))))
-    pushed, found = bias.at(steps), np.zeros((len(steps), length, _ERRORS))
-    nominal = tube.nominal[(steps[:, None] + np.arange(length)) % len(tube.nominal)]
-    for x, y, theta in itertools.product(ahead, left, turned):
-        offsets = np.column_stack(_placed(x, y, theta))
-        _, paths = loop.excursions(outage(tube.n), every, offsets=offsets, kept=length, follow=False)
-        deviation = paths - nominal
-        apart = deviation - np.einsum("isjk,sk->sij", maps, deviation[:, 0]) - pushed
-        found = np.fmax(found, np.abs(apart))
-    found = np.maximum(found, np.roll(found, -1, axis=0))
-    return found[np.arange(parts) * len(steps) // parts]
-
-
-def _placed(x: Floats, y: Floats, theta: Floats) -> tuple[Floats, Floats, Floats]:
-    """How AGVs on their reference must be displaced, in their own frame, to see it at these errors."""
-    cos, sin = np.cos(theta), np.sin(theta)
-    return -cos * x - sin * y, sin * x - cos * y, -theta

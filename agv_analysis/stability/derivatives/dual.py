@@ -240,15 +240,10 @@ def _sum(a: Floats, a_inputs: Inputs, b: Floats, b_inputs: Inputs) -> tuple[Floa
     if not a_inputs:
         return b, b_inputs
     inputs, positions = _union(a_inputs, b_inputs)
-    total = np.empty((len(inputs), a.shape[1]))
-    for k, (in_a, in_b) in enumerate(positions):
-        if in_b < 0:
-            total[k] = a[in_a]
-        elif in_a < 0:
-            total[k] = b[in_b]
-        else:
-            np.add(a[in_a], b[in_b], out=total[k])
-    return total, inputs
+    rows = [
+        a[in_a] if in_b < 0 else b[in_b] if in_a < 0 else a[in_a] + b[in_b] for in_a, in_b in positions
+    ]  # fmt: skip
+    return np.stack(rows), inputs
 
 
 def chain(value: Floats, *terms: tuple[Any, Scalar]) -> Dual:

@@ -9,7 +9,8 @@ import pytest
 
 from agv_analysis.corridor.lap_loop import LapLoop, Outcomes
 from agv_analysis.corridor.outage_sequences import worst_sequence
-from agv_analysis.corridor.outer_tube import LONG, Tube, largest_n, outer_tube, with_remainder
+from agv_analysis.corridor.outer_tube import LONG, Tube, largest_n, outer_tube
+from agv_analysis.corridor.second_order import nonlinear_tube
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.stability.linear_loop import LinearLoop
 from agv_analysis.stability.scenario_loop import loop_on_lap
@@ -64,13 +65,15 @@ def random_outcomes(rng: np.random.Generator, n: int, steps: int) -> Outcomes:
 )
 def test_the_nonlinear_loop_stays_in_it(n: int, settings: list[str]) -> None:
     loop, linear, found = tube_of(n, *settings, half_width=1.0)
-    covering = with_remainder(loop, linear, found)
-    assert covering is not None
-    assert covering.deviation >= found.deviation
+    nonlinear = nonlinear_tube(loop, linear, found)
+    assert nonlinear is not None
+    assert nonlinear.is_proved
+    assert nonlinear.tube.n == n
+    assert nonlinear.tube.deviation >= found.deviation
     rng = np.random.default_rng(1)
     sequences = [random_outcomes(rng, n, 500) for _ in range(12)]
     worst = worst_sequence(loop, n, sequences)
-    assert worst.deviation <= covering.deviation <= 1.3 * worst.deviation
+    assert worst.deviation <= nonlinear.tube.deviation <= 1.3 * worst.deviation
 
 
 def test_what_is_proved_is_never_more_than_what_is_refuted() -> None:
