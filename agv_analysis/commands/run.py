@@ -262,7 +262,7 @@ def _largest(one: Vehicle) -> float:
 
 
 def _deviation(one: Vehicle) -> str:
-    from agv_analysis.report.table import metres
+    from agv_analysis.metrics.distance_text import metres
 
     return metres(_largest(one))
 

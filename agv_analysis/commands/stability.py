@@ -125,18 +125,16 @@ def command(
         said_of_twins += f"; {too_short(twins.left_without_losses)}"
     policy = scenario.error_detector.policy
     outdated = ("An outdated pose is", _POLICIES.get(policy, f"taken on by error_detector.policy {policy}"))
+    best, why_no_gain = _best_gains(scenario)
+    gains = [(f"For {objective.replace('_', ' ')}", choice.words) for objective, choice in best.items()]
     groups = {
         "How much the loop can take": [outdated, *found.rows(), ("Simulation check", said_of_twins)],
         "Corridor": [*(() if within is None else within.rows()), *(() if kept is None else kept.rows())],
         "Verdict": [("Decided by", by_what(verdict.criterion)), ("Because", verdict.reason)],
+        "Best K_x": gains or [("For any aim", why_no_gain)],
     }
     shown = ((title, [(name, escape(value)) for name, value in rows]) for title, rows in groups.items() if rows)
     print_groups(console, shown)
-    best, why_no_gain = _best_gains(scenario)
-    for objective, choice in best.items():
-        console.print(f"Best K_x, {objective.replace('_', ' ')}: {escape(choice.words)}")
-    if not best:
-        console.print(f"Best K_x: {why_no_gain}")
     if found.recommendation:
         console.print(f"[bold]Design with[/] {escape(found.recommendation)}.")
     for sentence in found.disagreements():
@@ -165,10 +163,10 @@ def _headlines(verdict: Verdict, evidence: Evidence, within: Corridor | None) ->
     from rich.markup import escape
 
     from agv_analysis.report.table import colour_of
-    from agv_analysis.report.verdict_sentence import in_words
+    from agv_analysis.report.verdict_sentence import beside_track, in_words
     from agv_analysis.stability.verdict import GREEN
 
-    said = in_words(verdict.word, evidence.n)
+    said = in_words(verdict.word, evidence.n) + beside_track(verdict.word, evidence)
     yield "Verdict", f"[bold {colour_of(verdict.word)}]{said[0].upper()}{said[1:]}[/]"
     if verdict.word not in GREEN:
         yield "Because", escape(verdict.reason)
@@ -245,7 +243,7 @@ def _map(scenario: Scenario, axes: str, points: int, csv_file: Path, picture: Pa
         with step_bar(points * points, "within the corridor") as progress:
             found = with_corridor(found, scenario, progress)
     write_csv(csv_file, found)
-    draw(picture, found)
+    draw(picture, found, scenario)
     if best := best_point(found):
         click.echo(f"corridor: {best}")
     click.echo(f"map:     {csv_file}\npicture: {picture}")

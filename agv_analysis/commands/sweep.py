@@ -164,7 +164,8 @@ def _write_reports(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None
 def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from rich.console import Console
 
-    from agv_analysis.report.table import metres, print_framed
+    from agv_analysis.metrics.distance_text import metres
+    from agv_analysis.report.table import print_framed
     from agv_analysis.sweep.verdicts import words_said
 
     names = ("unstable\nruns", "share of\nthem", "95 %\nconfidence", "steps to\n1 cm", "largest\ndeviation")
@@ -197,7 +198,7 @@ def _headlines(sweep: Sweep, rows: list[dict[str, Any]]) -> Iterator[tuple[str, 
     """Where the loop is stable, how far it strays at best, and how sure that is: with rich's markup."""
     from rich.markup import escape
 
-    from agv_analysis.report.table import metres
+    from agv_analysis.metrics.distance_text import metres
     from agv_analysis.sweep.sweep_sentence import best_point, is_calm, sweep_reason, sweep_sentence
 
     yield "Verdict", escape(sweep_sentence(rows, *sweep.axes))
@@ -219,17 +220,28 @@ _IN_A_LAP = "leaves in\na lap"
 
 
 def _table(sweep: Sweep, names: Sequence[str] = ()) -> Table:
-    """A table that begins with a column for each axis, as narrow as its name allows."""
+    """A table that begins with a column for each axis, as narrow as a name allows that tells it from the others."""
     from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
-    for axis in sweep.axes:
-        name = axis.name.replace(".", ".\n") if len(axis.name) > 11 else axis.name
-        table.add_column(name, justify="right", no_wrap=True)
+    for name in _short_names([axis.name for axis in sweep.axes]):
+        table.add_column(escape(name.replace(".", ".\n")), justify="right", no_wrap=True)
     for name in names:
         table.add_column(escape(name), justify="right", no_wrap=name != _IN_A_LAP)
     return table
+
+
+def _short_names(names: Sequence[str]) -> list[str]:
+    """Of each name with points the shortest ending that none of the others has: `kx`, `uplink.p`, `downlink.p`."""
+
+    def short(name: str) -> str:
+        parts = name.split(".")
+        endings = (".".join(parts[place:]) for place in range(len(parts) - 1, 0, -1))
+        others = [other for other in names if other != name]
+        return next((end for end in endings if not any(f".{other}".endswith(f".{end}") for other in others)), name)
+
+    return [short(name) for name in names]
 
 
 def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:

@@ -20,7 +20,8 @@ from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.metrics.confidence import computed, percent
-from agv_analysis.metrics.duration_text import duration_text
+from agv_analysis.metrics.distance_text import at_most, metres
+from agv_analysis.metrics.duration_text import duration_text, outage_text
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability import joint_spectral_radius
@@ -35,7 +36,7 @@ _DIVERGED = 1e3
 
 LOOKS_AHEAD = "the law looks ahead, so that the loop's errors are not the AGV's deviation"
 
-NOT_ALONE = "messages take time or depend on the place, so that there are not outages alone"
+NOT_ALONE = "messages are delayed, or lost depending on the place, so that outages alone do not describe the link"
 
 _NEVER_SETTLES = "the loop does not settle even without losses"
 
@@ -104,7 +105,7 @@ class Corridor:
         leaves = f"leaves {_widths(self.widths)} with a probability of {probability(self.leaving.p_lap)} a lap"
         if self.rms.value is None:
             return leaves
-        return f"{f'RMS {self.rms.value:.3g} m' if math.isfinite(self.rms.value) else 'diverges'}; {leaves}"
+        return f"{f'RMS {metres(self.rms.value)}' if math.isfinite(self.rms.value) else 'diverges'}; {leaves}"
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Name and value of each figure, in plain text."""
@@ -122,12 +123,12 @@ class Corridor:
 
     def _single(self, found: SingleOutage) -> str:
         if found.n is None:
-            return f"all up to {LONGEST} slots stay inside, at most {found.deviation:.3g} m off"
+            return f"all up to {LONGEST} slots stay inside, {at_most(found.deviation)} off"
         if found.n < 0:
             return "none: the AGV is outside without any"
         where = f"({found.x:.3g}, {found.y:.3g}) m, {found.step * self.ts:.4g} s into the lap"
-        length = f"{counted(found.n, 'slot')} ({found.n * self.ts * 1e3:g} ms)"
-        return f"{length}, which leads {found.deviation:.3g} m off at most; worst at {where}"
+        length = f"{counted(found.n, 'slot')} ({outage_text(found.n * self.ts)})"
+        return f"{length}, which leads {metres(found.deviation)} off at most; worst at {where}"
 
     def _any(self) -> str:
         if self.n_any is None:
@@ -140,10 +141,10 @@ class Corridor:
         linear, nonlinear = self.linear_tube, self.nonlinear
         if linear is None:
             return f"no n ({self.tube_reason})" if self.tube_reason else "not even without outages"
-        by_linear = f"{counted(linear.n, 'slot')} by the linear loop, at most {linear.deviation:.3g} m off"
+        by_linear = f"{counted(linear.n, 'slot')} by the linear loop, {at_most(linear.deviation)} off"
         if nonlinear is None:
             return f"{by_linear}; what is of second order could not be covered"
-        covering = f"{counted(nonlinear.tube.n, 'slot')}, at most {nonlinear.tube.deviation:.3g} m off"
+        covering = f"{counted(nonlinear.tube.n, 'slot')}, {at_most(nonlinear.tube.deviation)} off"
         if nonlinear.is_proved:
             return covering
         return f"{by_linear}; with what is of second order, which was measured, {covering}"
@@ -304,7 +305,7 @@ def _stationary(loop: LapLoop) -> tuple[StationaryDeviation | None, str]:
     if not is_random(scenario):
         return None, "nothing is random"
     if chain is None:
-        return None, "the uplink is no Markov chain that alone loses messages"
+        return None, "the uplink is not a Markov chain of losses alone"
     if scenario.plant.slip_noise > 0.0:
         return None, "slip is random"
     if scenario.controller.steps_ahead:
@@ -349,10 +350,10 @@ def _widths(widths: Widths) -> str:
 
 
 def probability(p: Estimate) -> str:
-    """A probability with its interval; of a rare event not in per cent."""
+    """A probability with its interval; of an event that is rare for sure not in per cent."""
     if p.low == p.high:
         return f"{p.value:.4g}" if 0.0 < p.value < 0.001 else percent(p.value)
-    if p.value < 0.001:
+    if p.value < 0.001 and 0.0 < p.high < 0.001:
         return f"{p.value:.3g} ({p.low:.3g} .. {p.high:.3g})"
     if p.low > 0.999:
         return "above 99.9 %"
@@ -371,7 +372,8 @@ def _time(mean: Estimate | None) -> str:
         return f"more than {duration_text(mean.low)}"
     if mean.low == mean.high:
         return duration_text(mean.value)
-    return f"{duration_text(mean.value)} ({duration_text(mean.low)} .. {duration_text(mean.high)})"
+    low, high = (duration_text(end, like=mean.value) for end in (mean.low, mean.high))
+    return f"{duration_text(mean.value)} ({low} .. {high})"
 
 
 def _estimates(name: str, found: Estimate | None) -> dict[str, Any]:

@@ -90,7 +90,8 @@ def best_point(found: MarginMap) -> str:
         return ""
     rank = (-n_any,) if p_hour is None else (-n_any, p_hour)
     row, column = np.unravel_index(np.lexsort(tuple(key.ravel() for key in rank))[0], n_any.shape)
-    where = f"{found.labels[0]} = {found.first[row]:.4g}, {found.labels[1]} = {found.second[column]:.4g}"
+    place = zip(found.labels, (found.first[row], found.second[column]), strict=True)
+    where = ", ".join(_with_unit(label, value) for label, value in place)
     n = int(n_any[row, column])
     outages = "any outages" if n >= LIMIT else f"any outages of up to {counted(n, 'slot')}"
     kept = f"best kept at {where}: in {outages}"
@@ -128,3 +129,9 @@ def _longest(advance: float, widths: Widths) -> int:
 def _rate(chain: Chain, n: int) -> float:
     """Share of the slots at which an outage becomes longer than n slots."""
     return 0.0 if n >= LIMIT or chain.loss_rate == 0.0 else outages_of(chain, n + 1)
+
+
+def _with_unit(label: str, value: float) -> str:
+    """The value of an axis: `kx = 25 1/s` of one with the label `kx [1/s]`."""
+    name, _, unit = label.rstrip("]").partition(" [")
+    return f"{name} = {value:.4g} {unit}".rstrip()

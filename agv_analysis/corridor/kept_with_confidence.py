@@ -22,6 +22,7 @@ from agv_analysis.corridor.single_outage import roughly
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
+from agv_analysis.metrics.distance_text import metres
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
 from agv_cloud.parameters import CSV, PATH
@@ -62,8 +63,8 @@ class Kept:
 
     def rows(self) -> list[tuple[str, str]]:
         """Name and value of each figure, in plain text."""
-        of_laps = f"{self.confidence:g} of all laps"
-        width = f"{self.width.value:.3g} m ({self.width.low:.3g} .. {self.width.high:.3g})"
+        of_laps = f"{100.0 * self.confidence:g} % of all laps"
+        width = f"{metres(self.width.value)} ({metres(self.width.low)} .. {metres(self.width.high)})"
         speed = (
             self.speed_reason if self.speed is None else f"{self.speed:.3g} m/s, with which {of_laps} keep the corridor"
         )

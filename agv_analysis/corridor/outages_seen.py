@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.corridor.corridor import probability
 from agv_analysis.corridor.shares import path_shares
 from agv_analysis.corridor.widths import Widths
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.link.heavy_tail import tail_is_heavy
 from agv_analysis.link.transitions import SAMPLES
-from agv_analysis.metrics.confidence import clopper_pearson
+from agv_analysis.metrics.confidence import clopper_pearson, percent
+from agv_analysis.metrics.deviation import DIVERGED
+from agv_analysis.metrics.distance_text import three_digits
 from agv_analysis.metrics.outages import outage_begins, outage_lengths
 from agv_analysis.run import Floats, Run
 from agv_ros.counted import counted
@@ -52,15 +55,12 @@ class RecordedOutages:
 
     def rows(self) -> list[tuple[str, str]]:
         """Name and value of each figure, in plain text."""
-        seen = (
-            f"{self.left} of {counted(self.outages, 'outage')} led outside, at most {self.largest:.3g} of the "
-            "half-width was used"
-        )
+        seen = f"{self.left} of {counted(self.outages, 'outage')} led outside, {_used(self.largest)}"
         found = [("Seen in the run", seen)]
-        bound = f"with 95 % confidence at most {self.at_most:.3g} of all outages lead outside"
+        bound = f"with 95 % confidence at most {percent(self.at_most)} of all outages lead outside"
         found.append(("Proved by the run", bound if self.outages else "nothing: there was no outage"))
         if self.tail is not None:
-            tail = f"{self.tail.value:.3g} ({self.tail.low:.3g} .. {self.tail.high:.3g}) of all outages"
+            tail = f"{probability(self.tail)} of all outages"
             found.append(("By the tail of their lengths", f"{tail}, from the {self.tail_of} longest"))
         return found
 
@@ -78,6 +78,19 @@ class RecordedOutages:
             "outages_per_hour": self.per_hour,
             "warnings": list(self.warnings),
         }
+
+
+def _used(share: float) -> str:
+    """How much of a corridor was used, at most."""
+    if not share <= DIVERGED:
+        return "and the AGV diverged"
+    if share >= _MANY_TIMES:
+        return f"up to {three_digits(share)} times the half-width away"
+    return f"at most {100.0 * share:.3g} % of the half-width was used"
+
+
+_MANY_TIMES = 10.0
+"""Share of a corridor from which on per cent say little."""
 
 
 def recorded_outages(run: Run, widths: Widths, n_single: int | None, settled: int | None) -> RecordedOutages:

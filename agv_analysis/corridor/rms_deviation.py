@@ -19,6 +19,7 @@ from agv_analysis.corridor.stationary_deviation import StationaryDeviation
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.link.markov_channel import Chain
+from agv_analysis.metrics.distance_text import metres
 
 FIRST_ORDER, SAMPLED, SIMULATED = (
     "second moments of the linear loop", "importance sampling of the nonlinear loop", "simulated laps",
@@ -52,12 +53,13 @@ class RmsDeviation:
             return f"{laps}; not known to first order: {self.reason}"
         if not math.isfinite(self.first_order):
             return f"{laps}; to first order its mean square does not settle"
-        others = f"{self.first_order:.3g} m to first order, {laps}"
+        first = f"{metres(self.first_order)} to first order"
+        others = f"{first}, {laps}"
         if self.value is None:
             return f"no answer: {self.reason}; {others}"
         if self.method == SAMPLED and self.interval is not None:
             return f"{_with_interval(Estimate(self.value, *self.interval))} by {SAMPLED}; {others}"
-        return others if self.method == FIRST_ORDER else f"{laps}; {self.first_order:.3g} m to first order is not right"
+        return others if self.method == FIRST_ORDER else f"{laps}; {first} is not right"
 
     def notes(self) -> Iterator[str]:
         """What must be said of it."""
@@ -106,5 +108,5 @@ def rms_deviation(
 
 def _with_interval(found: Estimate) -> str:
     if found.low == found.high:
-        return f"{found.value:.3g} m"
-    return f"{found.value:.3g} m ({found.low:.3g} .. {found.high:.3g})"
+        return metres(found.value)
+    return f"{metres(found.value)} ({metres(found.low)} .. {metres(found.high)})"

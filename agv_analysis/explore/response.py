@@ -14,10 +14,11 @@ from agv_analysis.corridor.single_outage import FEW_PLACES, LONGEST, roughly
 from agv_analysis.corridor.widths import Widths, widths_of
 from agv_analysis.metrics.convergence import convergence
 from agv_analysis.metrics.deviation import Deviation, deviation
+from agv_analysis.metrics.distance_text import at_most, metres
 from agv_analysis.metrics.outages import outage_lengths
 from agv_analysis.report.panels import LIMIT, OTHER, PINNED, REFERENCE, Panel, age, distance, speed, track
 from agv_analysis.report.plotly import figure
-from agv_analysis.report.table import at_most, deviation_sizes, metres
+from agv_analysis.report.table import deviation_sizes
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation.single import simulate

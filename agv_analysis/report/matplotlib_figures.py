@@ -47,6 +47,9 @@ COLOURS = {
     **dict(zip(DEVIATIONS, ("#1f6fb4", "#1b7f6d", "#a9861a", "#c85f17", "#b3157f"), strict=True)),
 }  # fmt: skip
 
+_COLUMN = 26
+"""Letters of a name that fit half the width of a figure."""
+
 _MOST_POINTS = 4000
 """Points of a line: more than a printer can show in a column."""
 
@@ -82,7 +85,21 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_aspect("equal", adjustable="datalim")
     if panel.y_range is not None:
         axes.set_ylim(*panel.y_range)
-    axes.legend(fontsize=6.0, loc="upper right")
+    is_short = all(len(line.name) <= _COLUMN for line in panel.lines)
+    legend_above(axes, columns=2 if is_short else 1)
+
+
+def legend_above(axes: Axes, columns: int = 2, **form: Any) -> None:
+    """The legend of axes above them, where it covers nothing."""
+    axes.legend(
+        fontsize=6.0,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=columns,
+        frameon=False,
+        borderaxespad=0.2,
+        **form,
+    )
 
 
 def _draw_line(axes: Axes, line: Line) -> None:
@@ -95,11 +112,10 @@ def _draw_line(axes: Axes, line: Line) -> None:
         axes.plot(line.x, line.y, ".", color=colour, ms=5.0, mew=0.0, alpha=0.25, zorder=1.0, label=line.name)
     elif line.style == RINGS:
         axes.plot(line.x, line.y, "o", color=colour, ms=6.0, mfc="none", mew=0.8, label=line.name)
-        for i, text in enumerate(line.labels):
-            at, place = (line.x[i], line.y[i]), (-5.0, 5.0 if i % 2 == 0 else -10.0)
-            axes.annotate(text, at, place, textcoords="offset points", ha="right", fontsize=5.0, color=colour)
     elif line.style == STEP:
         axes.step(line.x, line.y, where="post", color=colour, lw=0.6, label=line.name)
     else:
         dash = "--" if line.role == LIMIT else "-"
-        axes.plot(line.x, line.y, dash, color=colour, lw=0.6 if line.role == LIMIT else 0.9, label=line.name)
+        zorder = 1.5 if line.role == OTHER else 2.0  # under the line that matters
+        width = 0.6 if line.role == LIMIT else 0.9
+        axes.plot(line.x, line.y, dash, color=colour, lw=width, zorder=zorder, label=line.name)

@@ -13,6 +13,9 @@ from agv_analysis.report.panels import age, distance, speed, track
 from agv_analysis.run import Run
 from agv_ros.errors import UserError
 
+_ABOVE_LEGEND = 24.0
+"""From axes to their title, with two rows of a legend between [points]."""
+
 
 def draw(run: Run, path: Path) -> None:
     """Draw a run to a PNG, SVG or PDF file. Raises UserError if the file cannot be written."""
@@ -32,8 +35,8 @@ def draw(run: Run, path: Path) -> None:
         axes.set_xlabel("")
     of_speed = over_time[1]
     of_speed.set_yscale("symlog", linthresh=2.0 * max(0.5, float(np.abs(run.reference[:, 3]).max())))
-    from_above.set_title("Track")
-    over_time[0].set_title("Error, speed, age of the pose")
+    for axes, title in ((from_above, "Track"), (over_time[0], "Error, speed, age of the pose")):
+        axes.set_title(title, pad=_ABOVE_LEGEND)
     try:
         save_figure(figure, path, dpi=130)
     except (OSError, ValueError) as error:

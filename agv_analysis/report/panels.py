@@ -68,8 +68,6 @@ class Line:
     style: str = LINE
     slots: Slots | None = None
     """The slot behind each point, where there is one."""
-    labels: tuple[str, ...] = ()
-    """What is written beside each point, where something is."""
 
 
 @dataclass(frozen=True)
@@ -278,9 +276,8 @@ def unit_circle(analysis: Analysis) -> Panel:
     eigenvalues, multipliers = paper_eigenvalues(analysis.run), lifted_multipliers(analysis)
     lines = (
         Line("|z| = 1", np.cos(angle), np.sin(angle), LIMIT),
-        Line("lifted system", multipliers.real, multipliers.imag, LOST, MARKERS),
-        Line("paper's A(k)", eigenvalues.real, eigenvalues.imag, DRIVEN, MARKERS),
-        *_deciding({"lifted system": multipliers, "paper's A(k)": eigenvalues}),
+        *_eigenvalues("lifted system", multipliers, LOST),
+        *_eigenvalues("paper's A(k)", eigenvalues, DRIVEN),
     )
     title = (
         "Eigenvalues: the paper's along the run, the lifted system's for a pose always "
@@ -289,13 +286,12 @@ def unit_circle(analysis: Analysis) -> Panel:
     return Panel("eigenvalues", title, "Re", "Im", lines, equal=True)
 
 
-def _deciding(found: dict[str, NDArray[np.complex128]]) -> Iterator[Line]:
-    """The largest of the eigenvalues of each kind, with its modulus: the one that decides."""
-    largest = {name: values[np.abs(values).argmax()] for name, values in found.items() if len(values)}
-    if largest:
-        z = np.array(list(largest.values()))
-        labels = tuple(f"{name}: |z| = {abs(value):.5g}" for name, value in largest.items())
-        yield Line("largest, which decides", z.real, z.imag, PEAK, RINGS, labels=labels)
+def _eigenvalues(name: str, z: NDArray[np.complex128], role: str) -> Iterator[Line]:
+    """Eigenvalues of one kind, and a ring about the largest of them, which decides; its modulus is in the legend."""
+    yield Line(name, z.real, z.imag, role, MARKERS)
+    if len(z):
+        largest = z[[np.abs(z).argmax()]]
+        yield Line(f"{name}, largest: |z| = {abs(largest[0]):.5g}", largest.real, largest.imag, role, RINGS)
 
 
 def thinned(line: Line, most: int) -> Line:

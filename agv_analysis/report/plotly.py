@@ -195,19 +195,11 @@ def _trace(line: Line, most: int, markers: int) -> dict[str, Any]:
         return {**trace, "mode": "markers", "marker": {"color": colour, **marker}, **why}
     if line.style == RINGS:
         ring = {"symbol": "circle-open", "size": 14, "color": colour, "line": {"width": 2}}
-        return {**trace, "mode": "markers", "marker": ring, **_labels(line)}
+        return {**trace, "mode": "markers", "marker": ring}
     dash = {"dash": {LIMIT: "dash", PINNED: "dot"}[line.role]} if line.role in (LIMIT, PINNED) else {}
     shape = {"shape": "hv"} if line.style == STEP else {}
     width = 3 if line.role in DEVIATIONS else 1.5
     return {**trace, "mode": "lines", "line": {"color": colour, "width": width, **dash, **shape}}
-
-
-def _labels(line: Line) -> dict[str, Any]:
-    """Texts on the left of points, by turns above and below, for they may lie close to each other."""
-    if not line.labels:
-        return {}
-    places = [("top left", "bottom left")[i % 2] for i in range(len(line.labels))]
-    return {"mode": "markers+text", "text": list(line.labels), "textposition": places}
 
 
 def _why(slots: Slots) -> dict[str, Any]:

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from agv_analysis.metrics.distance_text import metres
 from agv_analysis.report.heat_map import colour_scale, heat_map_layout
 from agv_analysis.report.page import fill, versions, write_page
 from agv_analysis.report.panels import DRIVEN, LIMIT, Line, Panel, distance, plain, thinned
 from agv_analysis.report.plotly import figure, packed_values
 from agv_analysis.report.sweep_table import number, sweep_table
-from agv_analysis.report.table import metres
 from agv_analysis.report.tiles import Tile
 from agv_analysis.simulation.single import simulate, steps_of
 from agv_analysis.sweep.axis_words import axis_words
@@ -195,7 +195,7 @@ def draw_sweep_figures(sweep: Sweep, rows: Rows, folder: Path) -> None:
     """Draw the probability of instability to `folder`, as SVG and PDF. Raises UserError if that is not possible."""
     import matplotlib as mpl
 
-    from agv_analysis.report.matplotlib_figures import STYLE
+    from agv_analysis.report.matplotlib_figures import STYLE, WIDTH
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -203,7 +203,7 @@ def draw_sweep_figures(sweep: Sweep, rows: Rows, folder: Path) -> None:
         raise UserError(f"{folder}: cannot be written to: {error.strerror}") from None
     with mpl.rc_context(STYLE):
         for suffix in ("svg", "pdf"):
-            draw(sweep, rows, "instability", folder / f"instability.{suffix}")
+            draw(sweep, rows, "instability", folder / f"instability.{suffix}", (WIDTH, 0.8 * WIDTH))
 
 
 def _plain(value: Any) -> Any:

@@ -7,7 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from agv_analysis.metrics.confidence import computed
-from agv_analysis.report.table import metres
+from agv_analysis.metrics.deviation import DIVERGED
+from agv_analysis.metrics.distance_text import DIVERGES, three_digits
 from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.plan import Sweep
 
@@ -68,7 +69,16 @@ def _digits(value: float) -> str:
 
 
 def _distance(value: float) -> str:
-    return "-" if math.isnan(value) else metres(value).removesuffix(" m")
+    """A distance in a column of metres."""
+    if math.isnan(value):
+        return "-"
+    if not value <= DIVERGED:
+        return DIVERGES
+    return f"below {_SMALLEST:g}" if 0.0 < value < _SMALLEST else three_digits(value)
+
+
+_SMALLEST = 1e-4
+"""Distances [m] below which their digits say no more."""
 
 
 def _outages(value: float) -> str:

@@ -11,8 +11,10 @@ import numpy as np
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.metrics.convergence import Convergence
 from agv_analysis.metrics.deviation import DIVERGED, Deviation, Peak
+from agv_analysis.metrics.distance_text import DIVERGES, at_most, metres, speed_text, three_digits
+from agv_analysis.metrics.duration_text import outage_text
 from agv_analysis.metrics.last_excursion import LastExcursion
-from agv_analysis.metrics.outages import loss_causes
+from agv_analysis.metrics.outages import LinkOutages, loss_causes
 from agv_analysis.report.verdict_sentence import by_what, in_short
 from agv_analysis.scenario import Scenario
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
@@ -189,18 +191,18 @@ def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
     ms = 1e3 * run.ts
     seed = f", seed {run.scenario.relay.seed}" if run.seed_known else ""
     yield "Run", f"{counted(len(run), 'step')} of {ms:g} ms{seed}"
-    yield (
-        "Uplink",
-        f"{100.0 * up.loss_rate:.3g} % lost, in {counted(up.count, 'outage')} of {up.mean_burst:.1f} slots on average",
-    )
+    yield "Uplink", _losses(up)
     if len(causes := loss_causes(run.uplink)) > 1:
         yield "Lost by", ", ".join(f"{cause} ({count})" for cause, count in causes.items())
-    yield "Longest outage", f"{counted(up.longest, 'slot')} ({up.longest * ms:g} ms)"
+    yield (
+        "Longest outage",
+        f"{counted(up.longest, 'slot')} ({outage_text(up.longest * run.ts)})" if up.count else "none",
+    )
     yield (
         "Age of information",
         (
             f"n_ul: mean {up.age.mean:.2f}, p99 {up.age.p99}, at most {counted(up.age.max, 'step')} "
-            f"({up.age.max * ms:g} ms)"
+            f"({outage_text(up.age.max * run.ts)})"
         ),
     )
     acted = analysis.outages.command_age
@@ -208,16 +210,25 @@ def _link_rows(analysis: Observations) -> Iterator[tuple[str, str]]:
         yield (
             "Age by receive time",
             f"of the pose behind the command that acted: mean {acted.mean:.2f}, p99 {acted.p99}, at most {acted.max} "
-            f"steps ({acted.max * run.ts:g} s)",
+            f"steps ({outage_text(acted.max * run.ts)})",
         )
     down = analysis.outages.downlink
     if down.lost or down.age.max:
         yield (
             "Downlink",
             f"{100.0 * down.loss_rate:.3g} % lost, command at most {counted(down.age.max, 'step')} "
-            f"({down.age.max * ms:g} ms) old",
+            f"({outage_text(down.age.max * run.ts)}) old",
         )
     yield "Fitted channel", _fit(analysis)
+
+
+def _losses(up: LinkOutages) -> str:
+    """How many updates were lost, in how many outages of which length."""
+    if not up.count:
+        return "no update lost"
+    on_average = " on average" if up.count > 1 else ""
+    outages = f"{counted(up.count, 'outage')} of {counted(up.mean_burst, 'slot')}{on_average}"
+    return f"{100.0 * up.loss_rate:.3g} % lost, in {outages}"
 
 
 def _missing(topic: str, count: int) -> str:
@@ -243,15 +254,22 @@ def convergence_rows(found: Convergence, ms: float) -> Iterator[tuple[str, str]]
     ]
     seen += [f"not to {band}" for band, steps in bands.items() if steps is None and seen]
     yield "Settling", "; ".join(filter(None, (", ".join(seen), escape(first.reason))))
-    yield (
-        "Overshoot",
-        "not known"
-        if found.overshoot is None or np.isinf(found.overshoot)
-        else f"{100.0 * found.overshoot:.3g} % of the initial error",
-    )
+    yield "Overshoot", _overshoot(found.overshoot)
     yield "Damping of the speed", found.damping or "the run cannot tell"
     yield "Last excursion above 1 cm", _excursion(found.excursion)
     yield "Error", _error(found)
+
+
+def _overshoot(share: float | None) -> str:
+    if share is None or not share <= DIVERGED:
+        return "not known"
+    if share >= _MANY_TIMES:
+        return f"{three_digits(share)} times the initial error"
+    return "none" if share < _NO_OVERSHOOT else f"{100.0 * share:.3g} % of the initial error"
+
+
+_MANY_TIMES, _NO_OVERSHOOT = 10.0, 1e-4
+"""Overshoots from which on per cent say little, and below which there is none to speak of."""
 
 
 def deviation_rows(found: Deviation) -> Iterator[tuple[str, str]]:
@@ -260,7 +278,12 @@ def deviation_rows(found: Deviation) -> Iterator[tuple[str, str]]:
     if found.worst:
         yield "Largest deviations", "; ".join(_peak(peak) for peak in found.worst)
     if np.isfinite(found.speed):
-        yield "Speed asked for", f"at most {found.speed:.3g} m/s, turning at {found.turn_rate:.3g} rad/s"
+        yield "Speed asked for", _asked(found)
+
+
+def _asked(found: Deviation) -> str:
+    speed, turn_rate = speed_text(found.speed), f"{three_digits(found.turn_rate)} rad/s"
+    return speed if speed == DIVERGES else f"at most {speed}, turning at {turn_rate}"
 
 
 def deviation_sizes(found: Deviation) -> str:
@@ -274,16 +297,6 @@ def deviation_sizes(found: Deviation) -> str:
 def _peak(peak: Peak) -> str:
     cause = "no outage" if peak.outage is None else f"{peak.outage.link} outage of {counted(peak.outage.slots, 'slot')}"
     return f"{metres(peak.distance)} at {peak.seconds:g} s ({cause})"
-
-
-def at_most(value: float) -> str:
-    """A largest distance [m], as `metres`."""
-    return f"at most {metres(value)}" if value <= DIVERGED else metres(value)
-
-
-def metres(value: float) -> str:
-    """A distance [m] in three digits; of one that no track is long enough for only that the AGV diverges."""
-    return f"{value:.3g} m" if value <= DIVERGED else "diverges"
 
 
 def _excursion(found: LastExcursion | None) -> str:
@@ -332,7 +345,11 @@ def _fit(analysis: Observations) -> str:
 
 
 def _interval(estimate: Estimate) -> str:
-    return f"{estimate.value:.4f} ({estimate.low:.4f} .. {estimate.high:.4f})"
+    return f"{_probability(estimate.value)} ({_probability(estimate.low)} .. {_probability(estimate.high)})"
+
+
+def _probability(p: float) -> str:
+    return f"{p:.4g}" if 0.999 < p < 1.0 else f"{p:.3g}"
 
 
 def _judged(stable: bool | None, why: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from agv_analysis.corridor.corridor_of_run import CorridorOfRun
 from agv_analysis.metrics.confidence import percent_after_of
-from agv_analysis.report.table import metres
+from agv_analysis.metrics.distance_text import DIVERGES, metres, speed_text, three_digits
+from agv_analysis.metrics.duration_text import outage_text
 from agv_analysis.stability.analysis import Analysis, Observations
 from agv_analysis.stability.verdict import GREEN, SURE
 from agv_ros.counted import counted
@@ -36,11 +38,12 @@ def tiles(analysis: Observations, within: CorridorOfRun | None = None) -> Iterat
     yield Tile("corridor", "Corridor", *_corridor(within))
     outages = f"{counted(up.count, 'outage')}, {counted(up.mean_burst, 'slot')} on average" if up.count else "no outage"
     yield Tile("losses", "Lost updates", f"{100.0 * up.loss_rate:.3g} %", outages)
-    longest = f"{counted(up.longest, 'slot')} ({up.longest * run.ts * 1e3:g} ms)"
+    longest = f"{counted(up.longest, 'slot')} ({outage_text(up.longest * run.ts)})" if up.count else "none"
     yield Tile("outage", "Longest outage", longest, _guaranteed(analysis))
     if np.isfinite(deviation.speed):
-        asked = f"asked for at most, turning at {deviation.turn_rate:.3g} rad/s"
-        yield Tile("speed", "Top speed", f"{deviation.speed:.3g} m/s", asked)
+        top = speed_text(deviation.speed)
+        asked = "" if top == DIVERGES else f"asked for at most, turning at {three_digits(deviation.turn_rate)} rad/s"
+        yield Tile("speed", "Top speed", top, asked)
     else:
         yield Tile("speed", "Top speed", "not recorded", "")
 
@@ -63,7 +66,7 @@ def how_sure(analysis: Analysis) -> str:
 
 def confidence_text(probability: float) -> str:
     """How probable a stable loop is given the losses that were seen."""
-    return f"stable with a probability {percent_after_of(probability)}"
+    return f"stable with a probability {percent_after_of(probability or math.ulp(0.0))}"
 
 
 def _corridor(within: CorridorOfRun | None) -> tuple[str, str]:

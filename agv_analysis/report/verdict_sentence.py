@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from agv_analysis.metrics.distance_text import metres
+from agv_analysis.metrics.duration_text import outage_text
 from agv_analysis.stability.analysis import GAINS_UNKNOWN, Analysis, Observations
 from agv_analysis.stability.criteria import CRITERIA
 from agv_analysis.stability.verdict import (
@@ -14,6 +16,7 @@ from agv_analysis.stability.verdict import (
     SIMULATION,
     UNDECIDED,
     UNKNOWN,
+    Evidence,
 )
 from agv_ros.counted import counted
 
@@ -26,7 +29,7 @@ def sentence(analysis: Observations) -> str:
         return f"Whether the loop is stable cannot be said: {GAINS_UNKNOWN}."
     verdict, met = analysis.verdict, _met(analysis)
     if verdict.word in GREEN and analysis.evidence.beside_reference > BESIDE:
-        beside = f"The AGV settles up to {analysis.evidence.beside_reference:.3g} m beside its track"
+        beside = f"The AGV settles up to {metres(analysis.evidence.beside_reference)} beside its track"
         return f"{beside}; no update was lost." if _oldest(analysis) == 0 else f"{beside}, under {met} as well."
     if verdict.word == MEAN_SQUARE and analysis.run.downlink_lost.any():
         return (
@@ -57,6 +60,17 @@ def in_short(analysis: Observations) -> str:
         return "messages are missing that no channel lost"
     if not isinstance(analysis, Analysis):
         return GAINS_UNKNOWN
+    return _in_short(analysis) + beside_track(analysis.verdict.word, analysis.evidence)
+
+
+def beside_track(word: str, evidence: Evidence) -> str:
+    """How far beside its track a stable loop drives even without losses, where that is far; else empty."""
+    if word not in GREEN or not evidence.beside_reference > BESIDE:
+        return ""
+    return f", but {metres(evidence.beside_reference)} beside the track"
+
+
+def _in_short(analysis: Analysis) -> str:
     n, n_bursts, word = analysis.n, analysis.evidence.n_bursts, analysis.verdict.word
     if word == ASYMPTOTIC and n == 0:
         return "stable; no update was lost"
@@ -72,7 +86,7 @@ def in_words(word: str, n: int) -> str:
     return {
         ASYMPTOTIC: f"stable under any outages of up to {counted(n, 'slot')}" if n else "stable without losses",
         MEAN_SQUARE: "stable in mean square",
-        BOUNDED: "bounded; only the speed limit bounds the error",
+        BOUNDED: "not stable; bounded by the speed limit alone",
         UNDECIDED: "undecided; too little was seen of the link",
         INFEASIBLE: "infeasible; the loop does not settle even without losses",
         UNKNOWN: "unknown",
@@ -119,7 +133,7 @@ def _oldest(analysis: Observations) -> int:
 def _met(analysis: Observations) -> str:
     """The worst that the run has met."""
     oldest = _oldest(analysis)
-    age = f"{oldest * analysis.run.ts * 1e3:g} ms"
+    age = outage_text(oldest * analysis.run.ts)
     if _is_late(analysis):
         return f"poses up to {counted(oldest, 'step')} ({age}) old"
     if analysis.run.downlink_lost.any():

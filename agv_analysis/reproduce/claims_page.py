@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from agv_analysis.report.page import template, write_page
 from agv_analysis.reproduce.citation import ARXIV, AUTHORS, DOI, TITLE
 from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding
 from agv_analysis.reproduce.figures import Figure
-from agv_analysis.reproduce.report import TWINS, Table, measured_text, text_of
+from agv_analysis.reproduce.report import TWINS, Table, measured_text, summary, text_of
 
 PAGE = "claims.html"
 
@@ -48,11 +47,9 @@ def write(findings: Sequence[Finding], drawn: Sequence[Figure], tables: Sequence
         for one in drawn
     ]
     shown = {key for keys in SHOWN_IN.values() for key in keys}
-    counts = Counter(finding.judgement.verdict for finding in findings)
     text = template("claims.html.j2").render(
         title=f"The paper's claims: {TITLE}",
-        heading=f"Of {len(findings)} claims {counts[HOLDS]} hold and {counts[FAILS]} do not; {counts[REMARK]} hold "
-        f"with a remark, {counts[PART]} in part",
+        heading=summary(findings),
         authors=AUTHORS, paper=TITLE, arxiv=ARXIV, doi=DOI, twins=TWINS, pictures=pictures,
         others=_rows([finding for finding in findings if finding.claim.key not in shown]),
         tables=[(one.title, list(one.rows[0]), _cells(one), _source(folder / f"{one.key}.png")) for one in tables],

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from agv_analysis.output_file import not_linked_out, save_figure
+from agv_analysis.report.matplotlib_figures import legend_above
 from agv_analysis.reproduce.runs import GAINS, LIMIT, Runs, gain
 from agv_analysis.run import Floats, Run
 from agv_ros.errors import UserError
@@ -113,7 +114,7 @@ def write(figure: Figure, folder: Path) -> None:
         if math.isfinite(figure.linear_to):
             axes.set_yscale("symlog", linthresh=figure.linear_to)
         if len(figure.curves) > 1:
-            axes.legend(handlelength=1.2)
+            legend_above(axes, columns=len(figure.curves), handlelength=1.2)
         try:
             save_figure(canvas, folder / f"{figure.file_name}.svg", figure.where)
             save_figure(canvas, folder / f"{figure.file_name}.png", figure.where, dpi=300)

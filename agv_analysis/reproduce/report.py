@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from agv_analysis.output_file import JSON_MARK, MARKDOWN_MARK, not_linked_out
+from agv_analysis.report.table import print_framed
 from agv_analysis.reproduce.citation import ARXIV, AUTHORS, DOI, TITLE
 from agv_analysis.reproduce.claim import FAILS, HOLDS, PART, REMARK, Finding, Values
 from agv_analysis.version import version
 from agv_ros.errors import UserError
 
-_ROUNDING = 1e-9
+_ROUNDING = 1e-8
 """Below this a measured value differs between machines."""
 
 DIVERGED = 1e9
@@ -54,7 +56,10 @@ def text_of(value: Any) -> str:
         return str(value)
     if not abs(value) < DIVERGED:
         return "diverges"
-    return "0" if abs(value) < _ROUNDING else f"{value:.4g}"
+    if abs(value) < _ROUNDING:
+        return "0"
+    shown = f"{value:.4g}"
+    return shown if abs(value) < 1.0 else f"{float(shown):.10g}"  # no exponent for being large
 
 
 def measured_text(values: Values) -> str:
@@ -62,8 +67,17 @@ def measured_text(values: Values) -> str:
     return "; ".join(f"{name}: {text_of(value)}" for name, value in values.items())
 
 
+def summary(findings: Sequence[Finding]) -> str:
+    """Which claims hold, in a sentence without a full stop."""
+    counts = Counter(finding.judgement.verdict for finding in findings)
+    return (
+        f"Of {len(findings)} claims {counts[HOLDS]} hold and {counts[FAILS]} do not; {counts[REMARK]} hold with a "
+        f"remark, {counts[PART]} in part"
+    )
+
+
 def print_claims(findings: Sequence[Finding]) -> None:
-    """Print the claims, each with what was measured and the verdict."""
+    """Print which claims hold in a frame, then each with what was measured and the verdict."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table as Grid
@@ -78,17 +92,19 @@ def print_claims(findings: Sequence[Finding]) -> None:
         cells = (finding.claim.where, finding.claim.text, measured_text(finding.measured))
         grid.add_row(*map(escape, cells), verdict)
     console = Console(highlight=False)
-    console.print(grid)
+    print_framed(console, [("Verdict", escape(summary(findings))), ("Paper", escape(f"{TITLE} (arXiv:{ARXIV})"))])
     console.print(TWINS)
+    console.print(grid)
 
 
 def print_table(table: Table) -> None:
     """Print a table of the future work."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table as Grid
 
-    grid = Grid(title=escape(table.title), title_justify="left")
+    grid = Grid(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD)  # without borders it fits 80 columns
     for name in table.rows[0]:
         grid.add_column(escape(name), justify="right")
     for row in table.rows:

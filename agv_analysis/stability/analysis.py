@@ -12,7 +12,7 @@ from agv_analysis.metrics.convergence import Convergence, convergence
 from agv_analysis.metrics.deviation import Deviation, deviation
 from agv_analysis.metrics.outages import Outages, loss_causes, outages
 from agv_analysis.run import Run
-from agv_analysis.stability.criteria.criterion import Judgement, RunFacts
+from agv_analysis.stability.criteria.criterion import Judgement, RunFacts, change_text
 from agv_analysis.stability.criteria.paper_test import PaperTest
 from agv_analysis.stability.evidence import Judgements, evidence_of_run, verdict_of_run
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
@@ -157,19 +157,18 @@ class Analysis(Observations):
         paper = self.paper
         if self.infeasible:
             return found
-        if paper is not None and paper.stable and not self.lifted_stable:
+        lifted = self.lifted_radius
+        if paper is not None and paper.stable and not self.lifted_stable and lifted is not None:
             found.append(
-                f"the paper's test calls the loop stable, but a pose that is always {counted(self.n, 'step')} old "
-                "makes the "
-                f"error grow by a factor {self.lifted_radius:.4f} a step: the test takes the outdated pose for the "
+                f"the paper's test calls the loop stable, but with a pose that is always {counted(self.n, 'step')} old "
+                f"errors grow by {change_text(lifted - 1.0)}: the test takes the outdated pose for the "
                 "current one"
             )
         bursts = self.bursts
         if paper is not None and paper.stable and bursts is not None and bursts.verdict == UNSTABLE:
             found.append(
-                f"the paper's test calls the loop stable, but outages of {counted(bursts.worst, 'slot')} in a "
-                "row, again and "
-                f"again, make the error grow by a factor {bursts.lower:.4f} a step"
+                f"the paper's test calls the loop stable, but under outages of {counted(bursts.worst, 'slot')}, again "
+                f"and again, errors grow by {change_text(bursts.lower - 1.0)}"
             )
         if paper is not None and not paper.stable and self.bursts_stable:
             found.append(

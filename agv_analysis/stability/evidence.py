@@ -14,6 +14,7 @@ from agv_analysis.link.joint_chain import JointChain
 from agv_analysis.link.markov_channel import Chain, chain_of, gilbert_elliott
 from agv_analysis.link.periodic_outages import period_of, scripted_outages
 from agv_analysis.metrics.deviation import DIVERGED
+from agv_analysis.metrics.distance_text import metres
 from agv_analysis.run import Run
 from agv_analysis.scenario import Scenario
 from agv_analysis.simulation import simulate
@@ -347,8 +348,8 @@ def _contradictions(run: Run, driven: DrivenCommands, repeated: RepeatedRun | No
         return
     allowed = _TIMES_AS_FAR * repeated.largest_in_run + _TOLERANCE
     if not recorded <= allowed:
-        far = "diverged" if recorded > DIVERGED else f"was up to {recorded:.3g} m off its track"
+        far = "diverged" if recorded > DIVERGED else f"was up to {metres(recorded)} off its track"
         yield (
-            f"the AGV {far}, in the simulation under the same losses it was up to {repeated.largest_in_run:.3g} m off: "
-            "it is not driven by this law, these parameters or this model"
+            f"the AGV {far}, in the simulation under the same losses it was up to "
+            f"{metres(repeated.largest_in_run)} off: it is not driven by this law, these parameters or this model"
         )

@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from agv_analysis.metrics.deviation import DIVERGED
+from agv_analysis.metrics.distance_text import metres
 from agv_analysis.stability.confidence.link_confidence import LinkConfidence
 from agv_analysis.stability.driven_commands import DrivenCommands
 from agv_analysis.stability.repeated_run import RepeatedRun
@@ -167,9 +168,12 @@ def _where(evidence: Evidence) -> str:
     """How far from its reference a stable loop drives, where that is far."""
     where, repeated = "", evidence.repeated
     if evidence.beside_reference > BESIDE:
-        where += f"; even without losses it drives up to {evidence.beside_reference:.3g} m beside its reference"
+        where += f"; even without losses it drives up to {metres(evidence.beside_reference)} beside its reference"
     if evidence.is_disturbed and repeated is not None and repeated.largest_in_run > BESIDE:
-        where += f"; with its noise and slip, which are left out of this, up to {repeated.largest_in_run:.3g} m"
+        where += (
+            f"; noise and slip are left out of this: simulated with them the AGV is up to "
+            f"{metres(repeated.largest_in_run)} off in the second half of the run"
+        )
     return where
 
 
@@ -209,7 +213,8 @@ def _repeating(evidence: Evidence) -> Verdict:
 
 
 def _mean_square(evidence: Evidence) -> Verdict:
-    reason = _of_link(evidence) or "under this link the mean square of the error dies out"
+    link = "both links" if evidence.growth_of == "both_links" else "this link"
+    reason = _of_link(evidence) or f"under {link} the mean square of the error dies out"
     if evidence.growth_of == "both_links":
         margin = "commands were lost as well; under both links the mean square of the error dies out"
     elif evidence.growth_of != "mean_square":
@@ -227,7 +232,7 @@ def _late(evidence: Evidence, steps: int) -> Verdict:
         return _undecided(evidence)
     if evidence.lifted_radius < 1.0:
         shrinks = f"{age}, and the error shrinks"
-        return Verdict(ASYMPTOTIC, "lifted", f"{shrinks}; see n_max of stability", shrinks)
+        return Verdict(ASYMPTOTIC, "lifted", f"{shrinks}; `agv-ncs stability` says how old it may be", shrinks)
     return _not_stable(evidence, "lifted", f"{age}, and the error grows")
 
 
@@ -246,7 +251,7 @@ def _not_stable(evidence: Evidence, criterion: str, why: str) -> Verdict:
     if math.isinf(evidence.v_max) or repeated is None or not repeated.stays:
         return Verdict(UNSTABLE, criterion, f"none: {why}", why)
     only = (
-        f"only the limit on the speed bounds the error, at {repeated.largest_deviation:.3g} m in "
+        f"only the limit on the speed bounds the error, at {metres(repeated.largest_deviation)} in "
         f"{repeated.seconds:.0f} s of simulation"
     )
     return Verdict(
@@ -255,6 +260,9 @@ def _not_stable(evidence: Evidence, criterion: str, why: str) -> Verdict:
 
 
 def _grows(evidence: Evidence) -> str:
+    repeated = evidence.repeated
+    if repeated is not None and not repeated.settles:  # then it is not the link
+        return _even_without_losses(repeated)
     if evidence.growth_of == "both_links":
         return "commands are lost as well, and under both links the mean square of the error grows"
     if evidence.growth_of != "mean_square":
@@ -278,15 +286,19 @@ def _limit(evidence: Evidence) -> str:
     return f"{seen}; guaranteed limit: {'at least ' if evidence.is_least else ''}{evidence.n_bursts}"
 
 
+def _even_without_losses(repeated: RepeatedRun) -> str:
+    """What a loop does that does not settle even without losses."""
+    return f"simulated without any loss {repeated.unsettled or 'the loop does not settle on its nominal motion'}"
+
+
 def _against_stability(evidence: Evidence) -> str:
     """What the simulation of the nonlinear loop says against a stable one; empty if nothing."""
     repeated, twins = evidence.repeated, evidence.twins
     if repeated is not None:
         if not repeated.settles:
-            what = repeated.unsettled or "the loop does not settle on its nominal motion"
-            return f"simulated without any loss {what}"
+            return _even_without_losses(repeated)
         if not repeated.stays:
-            far = f"the deviation grows, to {repeated.largest_deviation:.3g} m after {repeated.seconds:.0f} s"
+            far = f"the deviation grows, to {metres(repeated.largest_deviation)} after {repeated.seconds:.0f} s"
             becomes = "the AGV diverges" if repeated.largest_deviation > DIVERGED else far
             return f"simulated under these losses again and again {becomes}"
         if not repeated.meets:

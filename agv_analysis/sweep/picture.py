@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agv_analysis.output_file import save_figure
+from agv_analysis.report.matplotlib_figures import legend_above
 from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.plan import Axis, Sweep, SweepError
+from agv_ros.counted import counted
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,6 +24,10 @@ INSTABILITY_COLOURS = ("#d8efe0", "#f3c77a", "#c0392b")
 """From a probability of instability of 0 to 1: the lines of all borders are seen on each, and each is seen in grey."""
 
 
+_SHEET = (8.0, 5.5)
+"""Size of a picture that stands by itself [inch]."""
+
+
 def border_colour(name: str) -> str:
     """Colour of a border of stability, by the place of its criterion among those that have one."""
     from agv_analysis.stability.criteria import CRITERIA
@@ -30,8 +36,8 @@ def border_colour(name: str) -> str:
     return _COLOURS[names.index(name) % len(_COLOURS)]
 
 
-def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path) -> None:
-    """Draw a column of the rows to a PNG, SVG or PDF file.
+def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path, size: tuple[float, float] = _SHEET) -> None:
+    """Draw a column of the rows to a PNG, SVG or PDF file of this size [inch].
 
     Raises SweepError for a sweep that has neither one nor two axes of numbers, or if the file cannot be written.
     """
@@ -39,13 +45,15 @@ def draw(sweep: Sweep, rows: list[dict[str, Any]], metric: str, path: Path) -> N
 
     if not can_draw(sweep):
         raise SweepError(f"{path}: only one or two axes of numbers make a picture, this sweep has {len(sweep.axes)}")
-    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     if len(sweep.axes) == 1:
         _curve(axes, sweep, rows, metric)
     else:
         figure.colorbar(_heat_map(axes, sweep, rows, metric), label=_title(metric))
-    axes.set_title(f"{_title(metric)}, {max(row['runs'] for row in rows)} seeds a point", fontsize="medium")
+    if size == _SHEET:  # in a paper the caption says it
+        runs = counted(max(row["runs"] for row in rows), "seed")
+        figure.suptitle(f"{_title(metric)}, {runs} a point", fontsize="medium")
     try:
         save_figure(figure, path, dpi=130)
     except (OSError, ValueError) as error:
@@ -75,7 +83,7 @@ def _curve(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) ->
         for place in places:
             axes.axvline(place, color=border_colour(name), ls="--", label=f"border: {name}")
     axes.set(xlabel=axis_words(axis, sweep.base), ylabel=_title(metric))
-    axes.legend(fontsize="small")
+    legend_above(axes)
 
 
 def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) -> Any:
@@ -95,7 +103,8 @@ def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str)
     for name, margin in found.items():
         axes.contour(*fine, np.ma.masked_invalid(margin), levels=[0.0], colors=border_colour(name), linestyles="--")
         axes.plot([], [], color=border_colour(name), ls="--", label=f"border: {name}")
-        axes.legend(loc="upper right", fontsize="small")
+    if found:
+        legend_above(axes)
     axes.set(xlabel=axis_words(across, sweep.base), ylabel=axis_words(up, sweep.base))
     return image
 

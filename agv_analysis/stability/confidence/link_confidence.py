@@ -13,6 +13,7 @@ Between 5 % and 95 % nothing is decided.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,7 +88,7 @@ class LinkConfidence:
             "unstable": "the mean square of the error grows",
             "undecided": "the recording does not show whether the mean square of the error dies out",
         }[worst.word]
-        more, sure = self.record_seconds_more, percent_after_of(worst.probability_stable)
+        more, sure = self.record_seconds_more, percent_after_of(worst.probability_stable or math.ulp(0.0))
         longer = "" if more is None else f"; recording about {more:g} s more would probably decide it"
         return f"{where}{said}: {worst.why} (the error dies out with a probability {sure}){longer}"
 

@@ -176,7 +176,9 @@ def _of_gilbert(posterior: GrowthPosterior, intervals: Intervals, goodness: Good
         few = counted(count, "complete outage is", "complete outages are")
         why = f"a Gilbert channel does not describe the outcomes, and {few} too few"
     if intervals.longest_open and intervals.longest_open >= intervals.outages.max(initial=0):
-        why += f"; an outage of at least {counted(intervals.longest_open, 'slot')} was not seen whole"
+        why += (
+            f"; an outage of at least {counted(intervals.longest_open, 'slot')} is cut off by an end of the recording"
+        )
     if probability > 1.0 - SURE and goodness.fits and tail_is_heavy(intervals.outages, _ADVANTAGE):
         probability, why = min(probability, 0.5), _HEAVY
     undecided = 1.0 - SURE < probability < SURE

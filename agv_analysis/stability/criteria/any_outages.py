@@ -19,6 +19,7 @@ from agv_analysis.stability.criteria.criterion import (
     Row,
     RunFacts,
     ScenarioFacts,
+    change_text,
     steps_text,
 )
 from agv_analysis.stability.joint_spectral_radius import UNSTABLE, BurstVerdict
@@ -68,7 +69,8 @@ def _why(found: BurstVerdict) -> str:
         proof = "proved by a common norm" if found.certificate is not None else "of the one sequence without outages"
         return f"joint spectral radius at most {found.upper:.6g}, {proof}"
     if found.verdict == UNSTABLE:
-        return f"outages of {counted(found.worst, 'slot')} grow by {found.lower:.6g} a step"
+        slots = counted(found.worst, "slot")
+        return f"under outages of {slots}, again and again, errors grow by {change_text(found.lower - 1.0)}"
     return f"joint spectral radius at least {found.lower:.6g}"
 
 

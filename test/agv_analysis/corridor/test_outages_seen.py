@@ -68,7 +68,10 @@ def test_a_recording_on_the_command_line(agv_ncs, tmp_path: Path) -> None:  # ty
     assert (found["half_width"], found["n_single"], found["recorded"]["left"]) == (0.12, 15, 0)
     assert found["recorded"]["p_outage_at_most"] == pytest.approx(1.0 - 0.05 ** (1 / 45))
     assert 0.0 < found["p_lap_interval"][0] < found["p_lap"] <= found["p_lap_interval"][1] <= 1.0
-    assert "of all outages lead outside" in " ".join(said.split())
+    said = " ".join(said.split())
+    assert "0 of 45 outages led outside, at most" in said
+    assert "% of the half-width was used" in said
+    assert "at most 6.44 % of all outages lead outside" in said  # 1 - 0.05^(1/45)
     status, said = agv_ncs("analyse", "bags/sample", "--corridor", "0")
     assert status == 2
     assert "'--corridor'" in said

@@ -184,7 +184,7 @@ def test_the_demo_settles_at_once_and_is_disturbed_until_its_end() -> None:
     )
     rows = dict(convergence_rows(convergence(run), 1e3 * TS))
     assert rows["Last excursion above 1 cm"] == "99.75 s, after an outage of 11 slots"
-    assert rows["Error"] == "5 m at the start, 1.37e-05 m at the end"
+    assert rows["Error"] == "5 m at the start, 0.0137 mm at the end"
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from agv_analysis.report.cannot_say import cannot_say
 from agv_analysis.report.eigenvalues import lifted_multipliers, paper_eigenvalues
 from agv_analysis.report.matplotlib_figures import draw_figures
 from agv_analysis.report.page import render, write_report
-from agv_analysis.report.panels import HALOS, LINE, Line, distance, panels, speed, thinned, track
+from agv_analysis.report.panels import HALOS, LINE, RINGS, Line, distance, panels, speed, thinned, track
 from agv_analysis.report.plotly import figure
 from agv_analysis.report.sweep_page import sweep_figure, write_sweep_report
 from agv_analysis.report.table import print_side_by_side, print_table
@@ -504,10 +504,11 @@ def test_a_thinned_line_keeps_its_gaps() -> None:
 
 def test_the_eigenvalues_that_decide_are_named(lap: Analysis) -> None:
     circle = next(panel for panel in panels(lap) if panel.key == "eigenvalues")
-    labels = next(line for line in circle.lines if line.labels).labels
+    lifted, paper = (line for line in circle.lines if line.style == RINGS)
     assert lap.paper is not None
-    assert labels[0] == f"lifted system: |z| = {lap.lifted_radius:.5g}"
-    assert float(labels[1].split()[-1]) <= lap.paper.radius * (1.0 + 1e-4)
+    assert lifted.name == f"lifted system, largest: |z| = {lap.lifted_radius:.5g}"
+    assert np.hypot(lifted.x[0], lifted.y[0]) == pytest.approx(lap.lifted_radius)
+    assert float(paper.name.split()[-1]) <= lap.paper.radius * (1.0 + 1e-4)
 
 
 def test_what_a_run_leaves_open_is_beside_its_verdict(lap: Analysis) -> None:

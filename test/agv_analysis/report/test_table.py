@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from agv_analysis.report.table import print_framed, print_table
+from agv_analysis.report.table import headline_rows, print_framed, print_table, rows
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate
 from agv_analysis.stability.analysis import analyse
@@ -72,3 +72,28 @@ def test_the_answer_has_at_most_five_lines_and_the_whole_reason_is_below(
     text = capsys.readouterr().out
     assert 3 <= len(framed(text)) <= 5
     assert "".join(analysis.verdict.reason.split()) in "".join(text.split())
+
+
+def figures_of(*settings: str) -> dict[str, str]:
+    """Headlines and figures of a simulated run, by name."""
+    analysis = analyse(simulate(load_scenario(str(REPO / "config/outages.yaml"), list(settings))))
+    return dict(rows(analysis)) | dict(headline_rows(analysis))
+
+
+def test_a_run_without_losses_has_no_outages_to_count() -> None:
+    found = figures_of("plant.duration=5.0", "relay.uplink.model=perfect")
+    assert found["Uplink"] == "no update lost"
+    assert found["Longest outage"] == "none"
+
+
+def test_a_run_that_diverges_has_no_numbers_of_a_hundred_digits() -> None:
+    found = figures_of("plant.duration=60.0", "controller.kx=500.0")
+    assert found["Deviation"] == found["Speed asked for"] == "diverges"
+    assert found["Overshoot"] == "not known"
+    assert "without any loss" in found["Because"]
+    assert not any("e+" in value or "inf" in value.split() for value in found.values())
+
+
+def test_a_stable_loop_beside_its_track_says_so_in_the_first_line() -> None:
+    """With 0.3 m/s the AGV cuts the corners of a track that is driven at up to 1.5 m/s."""
+    assert "m beside the track" in figures_of("controller.v_max=0.3")["Verdict"]

@@ -393,6 +393,7 @@ def test_other_values_refute_a_claim(key: str) -> None:
         (1e-31, "0"),
         (1e196, "diverges"),
         (0.000615, "0.000615"),
+        (260_312.4, "260300"),
     ],
 )
 def test_values_as_people_read_them(value: Any, text: str) -> None:

@@ -317,7 +317,7 @@ def test_a_limit_of_just_the_reference_s_speed_never_makes_up_for_what_was_lost(
 def test_a_noisy_run_is_no_contradiction_to_its_own_simulation() -> None:
     found = of(LINE, "plant.noise_theta=0.5", "plant.noise_xy=5.0", "plant.duration=20.0")
     assert found.verdict.word == "asymptotic"
-    assert "with its noise and slip, which are left out of this, up to" in found.verdict.reason
+    assert "noise and slip are left out of this: simulated with them the AGV is up to" in found.verdict.reason
 
 
 def test_the_reason_of_an_unstable_word_is_no_reason_for_doubt() -> None:

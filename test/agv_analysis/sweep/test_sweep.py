@@ -519,3 +519,16 @@ def test_the_reason_is_the_one_that_most_points_share_whatever_its_numbers() -> 
     runs_alone = [{name: value for name, value in row.items() if "verdict" not in name} for row in rows]
     assert sweep_reason(runs_alone, *kx).endswith("do not come closer in the simulated runs")
     assert sweep_reason([], *kx) == ""
+
+
+def test_the_tables_of_a_sweep_fit_80_columns(agv_ncs: Any) -> None:
+    """Axes with long names are called by the shortest endings that tell them apart."""
+    status, said = agv_ncs(
+        "sweep", "config/outages.yaml", "--vary", "error_detector.policy=hold,predict", "--vary",
+        "relay.uplink.p=0.0123,0.05", "--vary", "relay.downlink.p=0.1,0.2", "--set", "plant.duration=2.0",
+    )  # fmt: skip
+    assert status == 0
+    assert "…" not in said
+    heads = [line.split() for line in said.splitlines() if line.strip().startswith("policy")]
+    assert heads[0][:1] == ["policy"]
+    assert max(map(len, said.splitlines())) <= 80
