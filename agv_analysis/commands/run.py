@@ -223,6 +223,7 @@ def _print_fleet(vehicles: list[Vehicle]) -> None:
 
 def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
     """What the fleet does, and which AGV is the reason, with rich's markup; nothing without recordings."""
+    from agv_analysis.metrics.confidence import percent
     from agv_analysis.report.table import colour_of
     from agv_analysis.runtime.fleet import instability
     from agv_analysis.sweep.verdicts import words_said
@@ -241,8 +242,8 @@ def _headlines(vehicles: list[Vehicle]) -> Iterator[tuple[str, str]]:
         yield (
             "Unstable",
             (
-                f"{found.unstable} of {counted(found.judged, 'AGV')}, {found.fraction:.1%} "
-                f"({found.low:.1%} .. {found.high:.1%} with {found.confidence:.0%} confidence)"
+                f"{found.unstable} of {counted(found.judged, 'AGV')}, {percent(found.fraction)} "
+                f"({percent(found.low)} .. {percent(found.high)} with {percent(found.confidence)} confidence)"
             ),
         )
 

@@ -165,9 +165,10 @@ def _is_broad(panel: Panel) -> bool:
 
 
 def _y_axis(panel: Panel, is_tight: bool) -> dict[str, Any]:
-    axis: dict[str, Any] = {"title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "power"}
+    # Of a large linear axis 50k is shorter than 0.5 x 10^5, which would lie over its title.
+    axis: dict[str, Any] = {"title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "SI"}
     if panel.log:
-        axis["type"] = "log"
+        axis |= {"type": "log", "exponentformat": "power"}
     if panel.equal:
         axis |= {"scaleanchor": "x", "scaleratio": 1} | ({"constrain": "domain"} if is_tight else {})
     if panel.y_range is not None:

@@ -36,7 +36,10 @@ def tiles(analysis: Observations, within: CorridorOfRun | None = None) -> Iterat
         when += f", after an outage of {counted(worst.outage.slots, 'slot')}"
     yield Tile("deviation", "Worst deviation", metres(deviation.largest), when or deviation.reason)
     yield Tile("corridor", "Corridor", *_corridor(within))
-    outages = f"{counted(up.count, 'outage')}, {counted(up.mean_burst, 'slot')} on average" if up.count else "no outage"
+    on_average = " on average" if up.count > 1 else ""
+    outages = (
+        f"{counted(up.count, 'outage')}, {counted(up.mean_burst, 'slot')}{on_average}" if up.count else "no outage"
+    )
     yield Tile("losses", "Lost updates", f"{100.0 * up.loss_rate:.3g} %", outages)
     longest = f"{counted(up.longest, 'slot')} ({outage_text(up.longest * run.ts)})" if up.count else "none"
     yield Tile("outage", "Longest outage", longest, _guaranteed(analysis))

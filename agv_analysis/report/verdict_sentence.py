@@ -47,7 +47,8 @@ def sentence(analysis: Observations) -> str:
         return f"Whether the loop is stable cannot be said: {verdict.reason}."
     if verdict.word == INFEASIBLE:
         return f"The AGV does not keep to its track even on a perfect link: {analysis.infeasible}."
-    if verdict.criterion == SIMULATION or (_oldest(analysis) == 0 and not analysis.run.downlink_lost.any()):
+    repeated, is_lossless = analysis.evidence.repeated, _oldest(analysis) == 0 and not analysis.run.downlink_lost.any()
+    if verdict.criterion == SIMULATION or is_lossless or (repeated is not None and not repeated.settles):
         return f"The AGV does not keep to its track: {verdict.reason}."
     if verdict.word == BOUNDED:
         return f"The AGV does not settle on its track under {met}; only its speed limit keeps it near."

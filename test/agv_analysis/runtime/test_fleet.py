@@ -237,7 +237,7 @@ def test_the_command_says_how_each_fared(agv_ncs: AgvNcs, tmp_path: Path, how: t
     assert [row["vehicle"] for row in rows] == ["agv_01", "agv_02"]
     assert [row["steps"] for row in content["vehicles"]] == [2000, 2000]
     assert (content["unstable"], content["judged"], content["fraction"]) == (0, 2, 0.0)
-    assert "0 of 2 AGVs, 0.0% (0.0% .. 84.2% with 95% confidence)" in said
+    assert "0 of 2 AGVs, 0 % (0 % .. 84.2 % with 95 % confidence)" in said
     worst = max(content["vehicles"], key=lambda one: one["deviation"]["max"])
     assert re.search(rf"│ +Deviation +largest: {worst['deviation']['max']:.3g} m \({worst['vehicle']}\) +│", said)
     assert said.index("Verdict") < said.index("Twins: ")
@@ -253,7 +253,7 @@ def test_an_unstable_fleet_is_called_so(agv_ncs: AgvNcs, tmp_path: Path) -> None
     bag = tmp_path / "fleet"
     status, said = agv_ncs("run", PAPER, "--set", "controller.kx=1000.0", "--fleet", 2, "--duration", 1, "--bag", bag)
     assert status == 0, said[-2000:]
-    assert "2 of 2 AGVs, 100.0% (15.8% .. 100.0% with 95% confidence)" in said
+    assert "2 of 2 AGVs, 100 % (15.8 % .. 100 % with 95 % confidence)" in said
     assert re.search(r"Verdict +2 unstable ", said)
     assert re.search(r"Deviation +largest: diverges \(agv_0[12]\)", said)
 
