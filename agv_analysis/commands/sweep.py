@@ -168,7 +168,7 @@ def _print_rows(sweep: Sweep, rows: list[dict[str, Any]]) -> None:
     from agv_analysis.report.table import print_framed
     from agv_analysis.sweep.verdicts import words_said
 
-    names = ("unstable\nruns", "share of\nthem", "95 %\nconfidence", "steps to\n1 cm", "largest\ndeviation")
+    names = ("unstable\nruns", "\nshare", "95 %\nconfidence", "steps to\n1 cm", "deviates\nup to")
     table = _table(sweep, names)
     for row in rows:
         table.add_row(

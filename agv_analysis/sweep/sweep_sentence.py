@@ -67,6 +67,8 @@ def reason_of(row: dict[str, Any]) -> str:
         said = "the runs are too short to say"
     else:
         said = "neighbouring trajectories that meet the same losses come closer in every run"
+    if row.get("verdict") in GREEN and not is_calm(row):  # it is not the verdict that objects
+        return said
     return str(row.get("verdict_reason") or said)
 
 
