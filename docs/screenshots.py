@@ -28,8 +28,9 @@ SLOW = ("plant.ts=0.02", "plant.duration=600.0", "controller.kx=10.0", "relay.up
 DRAWN = "return document.body.dataset.drawn"
 WATCHED = "return window.now && now.k > 1100 && document.querySelector('#tile-word.good')"
 EXPLORED = """return performance.now() > 5000 && document.querySelectorAll('#lap:not(.old) tr').length > 3
-  && document.querySelector('#badge-word.mean-square:not(.old)') && document.querySelector('#plot-time .main-svg')"""
-"""A page that was loaded is drawn anew some times, and its verdict is grey until it is computed again."""
+  && document.querySelector('#badge-word.mean-square:not(.old)') && document.querySelector('#plot-time .main-svg')
+  && [...document.querySelectorAll('.legendtext')].some(name => name.textContent.startsWith('tube'))"""
+"""A page that was loaded is drawn anew some times, its verdict is grey until it is computed, its tube comes last."""
 
 PAGES = {
     "report": ("simulate", "config/outages.yaml", "--corridor", "0.25", "--laps", "50"),

@@ -91,7 +91,7 @@ def best_point(found: MarginMap) -> str:
     rank = (-n_any,) if p_hour is None else (-n_any, p_hour)
     row, column = np.unravel_index(np.lexsort(tuple(key.ravel() for key in rank))[0], n_any.shape)
     place = zip(found.labels, (found.first[row], found.second[column]), strict=True)
-    where = ", ".join(_with_unit(label, value) for label, value in place)
+    where = ", ".join(_with_unit(label, float(value)) for label, value in place)
     n = int(n_any[row, column])
     outages = "any outages" if n >= LIMIT else f"any outages of up to {counted(n, 'slot')}"
     kept = f"best kept at {where}: in {outages}"
