@@ -42,7 +42,7 @@ setup(
     packages=find_packages(include=["agv_ros*", "agv_plant*", "agv_cloud*", "agv_analysis*", "agv_ncs*"]),
     package_data={
         **{package: ["py.typed"] for package in ("agv_ros", "agv_plant", "agv_cloud", "agv_analysis", "agv_ncs")},
-        "agv_ros": ["py.typed", "loopback.xml"],
+        "agv_ros": ["py.typed", "loopback.xml", "any_host.xml"],
         "agv_analysis.report": ["*.j2"],
         "agv_analysis.requirements": ["*.yaml"],
         "agv_analysis.watch": ["*.html"],

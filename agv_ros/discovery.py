@@ -18,7 +18,8 @@ _STATIC_PEERS = "ROS_STATIC_PEERS"
 _PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 """Environment variables of Fast DDS, up to version 2 and from version 3 on. Other middlewares ignore them."""
 
-_LOOPBACK = str(Path(__file__).with_name("loopback.xml"))
+_LOOPBACK, _ANY_HOST = (str(Path(__file__).with_name(name)) for name in ("loopback.xml", "any_host.xml"))
+"""Our profiles: for this host alone, and else. Both let a subscription have as many unread messages as its depth."""
 
 
 def limit_to_this_host(environment: MutableMapping[str, str]) -> None:
@@ -28,12 +29,12 @@ def limit_to_this_host(environment: MutableMapping[str, str]) -> None:
     a process with another range, do not.
     """
     environment.setdefault(DISCOVERY_RANGE, "LOCALHOST")
-    others = {name for name in _PROFILES if environment.get(name, _LOOPBACK) != _LOOPBACK}
     is_local = environment[DISCOVERY_RANGE] in ("LOCALHOST", "OFF") and not environment.get(_STATIC_PEERS)
+    is_others = any(environment.get(name, _LOOPBACK) not in (_LOOPBACK, _ANY_HOST) for name in _PROFILES)
     for name in _PROFILES:
-        if is_local and not others:
-            environment[name] = _LOOPBACK
-        elif environment.get(name) == _LOOPBACK:
+        if not is_others:
+            environment[name] = _LOOPBACK if is_local else _ANY_HOST
+        elif environment.get(name) in (_LOOPBACK, _ANY_HOST):
             del environment[name]
 
 

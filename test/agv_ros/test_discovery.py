@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +15,7 @@ from agv_ros.discovery import limit_to_this_host
 if TYPE_CHECKING:
     from test.conftest import Start
 
-OURS = str(Path(__file__).parents[2] / "agv_ros/loopback.xml")
+OURS, ELSEWHERE = (str(Path(__file__).parents[2] / "agv_ros" / name) for name in ("loopback.xml", "any_host.xml"))
 PROFILES = {"FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"}
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
@@ -29,15 +31,37 @@ RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
         ({"FASTRTPS_DEFAULT_PROFILES_FILE": "mine.xml"}, set()),
         ({RANGE: "SUBNET", **dict.fromkeys(PROFILES, OURS)}, set()),
         ({"FASTDDS_DEFAULT_PROFILES_FILE": OURS}, PROFILES),
+        ({"FASTDDS_DEFAULT_PROFILES_FILE": ELSEWHERE}, PROFILES),
     ],
 )
 def test_sockets_are_limited_where_discovery_is(before: dict[str, str], are_ours: set[str]) -> None:
     environment = dict(before)
     limit_to_this_host(environment)
     assert {name for name, value in environment.items() if value == OURS} == are_ours
-    kept = {name: value for name, value in before.items() if value != OURS}
+    is_chosen = "mine.xml" in before.values()
+    assert {name for name, value in environment.items() if value == ELSEWHERE} == (
+        set() if is_chosen else PROFILES - are_ours
+    )
+    kept = {name: value for name, value in before.items() if value not in (OURS, ELSEWHERE)}
     assert kept.items() <= environment.items()
     assert set(environment) - set(before) <= {RANGE, *PROFILES}
+
+
+def test_both_profiles_say_the_same_of_subscriptions() -> None:
+    def said(path: str) -> list[str]:
+        root = ElementTree.parse(path).getroot()
+        return [ElementTree.tostring(one, encoding="unicode").strip() for one in root.findall(".//{*}data_reader")]
+
+    assert len(said(OURS)) == 1
+    assert said(OURS) == said(ELSEWHERE)
+
+
+@pytest.mark.parametrize("range_", ["LOCALHOST", "SUBNET"])
+def test_a_subscription_that_falls_behind_in_its_publisher_s_process_hears_all(start: Start, range_: str) -> None:
+    """Of more messages than Fast DDS by itself lets a subscription have unread, 5000, beyond which it stays deaf."""
+    pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
+    found = start(sys.executable, str(Path(__file__).with_name("falls_behind.py")), env=os.environ | {RANGE: range_})
+    assert found.wait_for("received ").split()[-1] == "6010"
 
 
 def listening(pid: int) -> set[tuple[str, int]]:
