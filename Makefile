@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP ?= $(BIN)/python -m pip --disable-pip-version-check
 DEMO := bags/demo
-PROSE := README.md CONTRIBUTING.md SECURITY.md QUALITY_DECLARATION.md CHANGELOG.md $(filter-out docs/style.md,$(wildcard docs/*.md))
+PROSE := README.md CONTRIBUTING.md SECURITY.md QUALITY_DECLARATION.md CHANGELOG.md $(filter-out docs/style.md,$(wildcard docs/*.md docs/*/*.md))
 
 # Many tests wait, for processes to start and for DDS, so cores have time for more of them.
 WORKERS ?= $(shell $(PYTHON) -c 'import os; print(2 * len(os.sched_getaffinity(0)))')

@@ -91,7 +91,7 @@ def output_file(path: Path | str) -> Path:
     """
     path = not_linked_out(path)
     if path.is_file() and not is_forced() and not is_ours(path):
-        raise UserError(f"{path}: is no earlier output of agv-ncs and is kept: name another file, or give --force")
+        raise UserError(f"{path}: was not written by agv-ncs and is kept: name another file, or give --force")
     return path
 
 

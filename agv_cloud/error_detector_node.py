@@ -115,7 +115,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._detection.settings = self.settings
 
     def _show(self, points: Iterable[ReferencePoint]) -> None:
-        """Publish the reference for display, latched; it is no part of the loop, which does not wait for viewers."""
+        """Publish the reference for display, latched; it is not part of the loop, which does not wait for viewers."""
         path = Path()
         path.header.frame_id = FRAME_MAP
         for point in points:

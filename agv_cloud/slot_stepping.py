@@ -43,7 +43,7 @@ class SlotStepping:
         return self._sync.outdated
 
     def step_of(self, stamp_ns: int) -> int:
-        """Step of a stamp. Raises OffGridError for one that is no sampling instant of the run."""
+        """Step of a stamp. Raises OffGridError for one that is not a sampling instant of the run."""
         return self._steps.of(stamp_ns)
 
     def limit_window(self, steps: int) -> None:

@@ -32,7 +32,7 @@ class TimerStepping:
         self.oldest_ns = 0
 
     def step_of(self, stamp_ns: int) -> int:
-        """Step of a stamp. Raises OffGridError for one that is no sampling instant of the run."""
+        """Step of a stamp. Raises OffGridError for one that is not a sampling instant of the run."""
         return self._steps.of(stamp_ns)
 
     def add_pose(self, pose: StampedPose, now_ns: int) -> bool:

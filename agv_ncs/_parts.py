@@ -66,6 +66,6 @@ def register_channel(name: str, model: Model) -> None:
     """Add a channel model for this process: (channel, k, u, state) -> (lost, state).
 
     `channel` has the parameters of the link, `channel.arguments` those of the model; u are four numbers of slot k that
-    are uniform in [0, 1). Raises UserError for a name that is taken or if the model is no function.
+    are uniform in [0, 1). Raises UserError for a name that is taken or if the model is not a function.
     """
     CHANNELS.register(name, model)

@@ -342,7 +342,7 @@ class RelayParameters(TwoDomains):
         """Check what no single bound can say."""
         if self.command_type == TWIST and self.plan_steps:
             raise ParameterError(
-                "relay.command_type is twist, but plan_steps is not 0: a plan is no geometry_msgs/Twist"
+                "relay.command_type is twist, but plan_steps is not 0: a plan is not a geometry_msgs/Twist"
             )
 
 

@@ -13,7 +13,7 @@ fixed by the lengths of its strings, so a layout is one `struct.Struct`, made on
 kept. Padding is always written as zeros: equal values give equal bytes.
 
 Decoders accept any frame_id, either byte order and trailing bytes, and raise InvalidMessageError, never struct.error,
-on anything else: too short, a number that is not finite, a quaternion that is no rotation, no stamp.
+on anything else: too short, a number that is not finite, a quaternion that is not a rotation, no stamp.
 
 Source: OMG DDS-RTPS 2.5, 10.2 (encapsulation) and the CORBA CDR rules it refers to; REP 103 (units, yaw about +z).
 """

@@ -41,7 +41,7 @@ def refuse_irregular(path: str | os.PathLike[str]) -> None:
 def open_text(
     path: str, kind: type[UserError], encoding: str = "utf-8", newline: str | None = None
 ) -> Iterator[TextIO]:
-    """A text file to read from; raises an error of this kind, naming the file, if it cannot be read or is no text."""
+    """A text file to read from; raises an error of this kind, naming the file, if it cannot be read or is not text."""
     try:
         refuse_irregular(path)
         with open(path, encoding=encoding, newline=newline) as file:
@@ -52,5 +52,5 @@ def open_text(
         raise kind(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         if not isinstance(error, UnicodeDecodeError):  # a path with a NUL or a surrogate in it
-            raise kind(f"{path!r}: is no name of a file: {error}") from None
+            raise kind(f"{path!r}: is not the name of a file: {error}") from None
         raise kind(f"{path}: is not UTF-8 text: {error.reason} at byte {error.start}") from None

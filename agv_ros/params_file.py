@@ -16,7 +16,7 @@ from agv_ros.ros_yaml import RosYamlError, load
 def read_sections(path: str) -> dict[str, dict[str, Any]]:
     """Sections of a params file in its order: node name (without namespace; `/**` for all) -> value by dotted name.
 
-    Raises ParameterError if the file cannot be read or is no parameter file.
+    Raises ParameterError if the file cannot be read or is not a parameter file.
     """
     with open_text(path, ParameterError) as file:
         return parse_sections(file.read(), path)
@@ -77,24 +77,26 @@ def is_ros_own(name: str) -> bool:
     return name in ("use_sim_time", "start_type_description_service") or name.startswith("qos_overrides.")
 
 
-def parse_setting(text: str, known: Mapping[str, KnownParameters]) -> tuple[str, str, Any]:
+def parse_setting(text: str, known: Mapping[str, KnownParameters], option: str = "--set") -> tuple[str, str, Any]:
     """(node, parameter, value) of a setting `node.parameter=value`; an integer is taken for a double where one is due.
+
+    `option` is what the setting was given by.
 
     Raises ParameterError if the text has no such form, names no known parameter or gives a value that is not allowed.
     """
     target, equals, literal = text.partition("=")
     node, dot, name = target.strip().partition(".")
     if not equals or not dot:
-        raise ParameterError(f"--set {text}: expected node.parameter=value, as in controller.kx=25.0")
+        raise ParameterError(f"{option} {text}: expected node.parameter=value, as in controller.kx=25.0")
     if node not in known:
-        raise ParameterError(f"--set {text}: unknown node {node!r}, must be one of {', '.join(known)}")
+        raise ParameterError(f"{option} {text}: unknown node {node!r}, must be one of {', '.join(known)}")
     if name not in known[node]:
         why = known[node].refusal(name) or f"it has {', '.join(known[node])}"
-        raise ParameterError(f"--set {text}: {node} has no parameter {name!r}, {why}")
+        raise ParameterError(f"{option} {text}: {node} has no parameter {name!r}, {why}")
     try:
         return node, name, known[node][name].check(node, _value(literal, known[node][name]))
     except (ParameterError, RosYamlError) as error:
-        raise ParameterError(f"--set {text}: {error}") from None
+        raise ParameterError(f"{option} {text}: {error}") from None
 
 
 def _value(literal: str, parameter: Parameter) -> Any:

@@ -42,7 +42,7 @@ class Functions:
     def register(self, name: str, function: Function) -> None:
         """Add a function for this process alone, or put another one in the place of one that was added so.
 
-        Raises PartError for a name that is taken, or if it is no function.
+        Raises PartError for a name that is taken, or if it is not a function.
         """
         self._registered[name] = self._named(name, function)
         forget_parameters()

@@ -275,7 +275,7 @@ def try_part(part: Part, call: Call, *arguments: Any) -> None:
 
 
 def _shape(found: Any) -> Any:
-    """Tuples in tuples as they are, with None for each number, and the type of what is no number."""
+    """Tuples in tuples as they are, with None for each number, and the type of what is not a number."""
     if isinstance(found, tuple):
         return tuple(map(_shape, found))
     return None if isinstance(found, Real) else type(found)

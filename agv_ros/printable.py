@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 
 _UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
-"""Categories of characters that are no signs: control, format (as what turns the direction), surrogates, breaks."""
+"""Categories of characters that are not signs: control, format (as what turns the direction), surrogates, breaks."""
 
 
 def printable(text: str) -> str:

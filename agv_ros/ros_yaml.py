@@ -94,7 +94,7 @@ def _tree(node: yaml.Node) -> Any:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes, beside what is no string to YAML, what is none to ROS."""
+    """Quotes, beside what is not a string to YAML, what is none to ROS."""
 
 
 def _represent_string(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:

@@ -15,7 +15,7 @@ LATEST_NS = 2**31 * NS_PER_S - 1
 
 
 class OffGridError(ValueError):
-    """A stamp that is no sampling instant t_k with k >= 0."""
+    """A stamp that is not a sampling instant t_k with k >= 0."""
 
 
 def to_nanoseconds(seconds: float) -> int:
@@ -110,7 +110,7 @@ class NearestSteps:
         """Step of a stamp; one before the first, or more than MAX_LEAP steps past the last, is a new first one.
 
         So is the last of AGREEING stamps in a row that are far behind the newest: the clock has gone back. Raises
-        OffGridError for the stamp 0, which is no time.
+        OffGridError for the stamp 0, which means no time.
         """
         if stamp_ns == 0:
             raise OffGridError("the stamp is 0, which means 'no time': its sender must set header.stamp")

@@ -1,7 +1,7 @@
 """Measure and print: `python -m benchmarks [SUBJECT ...] [--json FILE] [--against FILE]`.
 
 Each subject is a module with a function `measure() -> list[Comparison]`. An aim that is missed is shown, and does not
-fail the command: how fast a machine is at a given moment is no property of the code.
+fail the command: how fast a machine is at a given moment is not a property of the code.
 """
 
 from __future__ import annotations

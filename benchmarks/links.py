@@ -1,6 +1,6 @@
 """Measured links: text formats against a regular expression over the same lines, pyarrow's CSV reader, the JSON module.
 
-Ours names what is no record, finds packets that are missing and dates all of them, which the peers do not.
+Ours names what is not a record, finds packets that are missing and dates all of them, which the peers do not.
 """
 
 from __future__ import annotations

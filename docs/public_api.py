@@ -133,7 +133,7 @@ def _json(documents: Mapping[str, str] = DOCUMENTS) -> Iterator[tuple[str, str]]
 
 
 def _keys(of: Any, above: str = "") -> Iterator[str]:
-    """Keys of a document, those inside of others after a dot; a list is its first item. Numbers are no names."""
+    """Keys of a document, those inside of others after a dot; a list is its first item. Numbers are not names."""
     if isinstance(of, dict):
         for key, value in of.items():
             if key.isdecimal():

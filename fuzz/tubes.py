@@ -41,7 +41,7 @@ POLICIES = {
 _HALF_WIDTH = 2.0
 _PLACES, _SLOTS = 200, 600
 _ROUNDING, _SMALL = 1e-9, 1e-6
-"""What is no departure, and bounds of which no share is taken [m, m, rad times the lever]."""
+"""What is not a departure, and bounds of which no share is taken [m, m, rad times the lever]."""
 
 
 @dataclass

@@ -83,7 +83,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # The same examples every time, however busy the machine.
 hypothesis.settings.register_profile(
     "agv_ncs", deadline=None, derandomize=True, database=None, max_examples=60,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow],  # a busy machine is no fault
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],  # a busy machine is not a fault
 )  # fmt: skip
 hypothesis.settings.load_profile("agv_ncs")
 

@@ -857,7 +857,7 @@ def test_help_starts_nothing(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_node_that_waits_says_for_whom(lone_bench: Bench) -> None:
-    """A recorder alone is no listener for whom a loop begins; any other node is."""
+    """A recorder alone is not a listener for whom a loop begins; any other node is."""
     controller = lone_bench.add(ControllerNode, wait_for_subscribers=1)
     (output,) = (one for one in controller.outputs if one.topic == "/edge/cmd_vel")
     recorder = Node("recorder", context=lone_bench.context, use_global_arguments=False)

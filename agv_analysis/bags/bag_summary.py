@@ -81,7 +81,7 @@ class BagSummary:
         by = f", recorded by ROS 2 {self.distro}" if self.distro else ""
         yield f"{self.path}: {counted(total, 'message')} on {counted(len(self.topics), 'topic')}{by}"
         if times:
-            yield f"from {_date(min(times))} on, for {max(times) - min(times):.3f} s"
+            yield f"starts at {_date(min(times))}, lasts {max(times) - min(times):.3f} s"
         yield from _table([_HEAD, *(_cells(topic) for topic in self.topics)])
         clocks = [[topic.name, *_clock_cells(topic.clock)] for topic in self.topics if topic.clock is not None]
         if clocks:

@@ -43,7 +43,7 @@ class Content(NamedTuple):
     """By channel."""
     definitions: list[Definition]
     lost: int
-    """Bytes that are no whole record."""
+    """Bytes that are not a whole record."""
 
 
 # -- from the record to its content -----------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ def find(content: bytes, places: list[Ints]) -> Content | None:
 
 
 def _definitions(content: bytes, position: int, end: int) -> list[Definition] | None:
-    """Records from `position` to `end`; None if these are not whole records, or if there is a message among them."""
+    """Records from `position` to `end`; None if these are not a whole records, or if there is a message among them."""
     found = []
     while position + RECORD.size <= end:
         opcode, length = RECORD.unpack_from(content, position)
@@ -204,7 +204,7 @@ def _definitions(content: bytes, position: int, end: int) -> list[Definition] | 
 
 
 def walk(content: bytes, is_cut: bool = False) -> Content:
-    """Messages of a chunk without its index, from record to record; what is no record is passed over.
+    """Messages of a chunk without its index, from record to record; what is not a record is passed over.
 
     `is_cut`: the content ends anywhere, so that its last record need not be whole.
     """

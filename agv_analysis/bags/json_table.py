@@ -78,7 +78,7 @@ class JsonTable:
         self._columns: dict[str, _Column] = {}
         self._rows: NDArray[np.void] | None = None
         self.misfits = 0
-        """Messages that are no JSON objects."""
+        """Messages that are not JSON objects."""
         self.first_misfit = ""
         self._misfit_times: list[int] = []
 

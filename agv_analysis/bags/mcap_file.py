@@ -102,7 +102,7 @@ class McapFile:
     """Reads one MCAP file. Everything but the batches is complete only after these have been read."""
 
     def __init__(self, path: Path, keep_all: bool = False) -> None:
-        """Open the file. Raises BagError if it cannot be read or is no MCAP file.
+        """Open the file. Raises BagError if it cannot be read or is not an MCAP file.
 
         `keep_all`: attachments, records of unknown kinds, and the messages of channels that are not described, whose
         topic is unknown.
@@ -190,7 +190,9 @@ class McapFile:
         if not begin:
             raise BagError(f"{self.path}: is empty")
         if not (self._source.is_record(len(MAGIC)) and self._source.head(len(MAGIC))[0] == HEADER):
-            raise BagError(f"{self.path}: is no MCAP file: begins with {begin.hex(' ')} instead of {MAGIC.hex(' ')}")
+            raise BagError(
+                f"{self.path}: is not an MCAP file: begins with {begin.hex(' ')} instead of {MAGIC.hex(' ')}"
+            )
         self.findings.add(f"file that begins with {begin.hex(' ')} instead of {MAGIC.hex(' ')}")
 
     def _read_summary(self) -> None:

@@ -72,7 +72,7 @@ def installed_definition(name: str) -> str:
     """
     found = _NAME.fullmatch(name)
     if found is None:
-        raise UserError(f"{name!r} is no name of a message type, such as geometry_msgs/msg/PoseStamped")
+        raise UserError(f"{name!r} is not the name of a message type, such as geometry_msgs/msg/PoseStamped")
     package, part, kind = found["package"], found["part"], found["kind"]
     for share in _share_folders(package):
         path = share / package / (part or "msg") / f"{kind}.{part or 'msg'}"

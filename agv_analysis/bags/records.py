@@ -233,7 +233,7 @@ def parse_index(content: bytes) -> Index:
     cursor = Cursor(content)
     channel, entries = cursor.number(2), cursor.block()
     if len(entries) % 16:
-        raise DamagedError(f"a message index of {len(entries)} bytes, which is no whole number of entries")
+        raise DamagedError(f"a message index of {len(entries)} bytes, which is not a whole number of entries")
     return Index(channel, np.frombuffer(entries, "<i8")[1::2])
 
 

@@ -46,7 +46,7 @@ class SqliteFile:
     """Reads one .db3 file; it knows one time of a message only."""
 
     def __init__(self, path: Path, keep_all: bool = False) -> None:
-        """Open the file. Raises BagError if it cannot be read or is no database of rosbag2.
+        """Open the file. Raises BagError if it cannot be read or is not a database of rosbag2.
 
         `keep_all`: the messages of topics that are not described, too.
         """
@@ -166,7 +166,7 @@ class SqliteFile:
             if channel is None:
                 continue
             if not isinstance(time, int) or not isinstance(data, bytes):
-                self.findings.add(f"{channel.topic}: row that is no message, left out", is_loss=True)
+                self.findings.add(f"{channel.topic}: row that is not a message, left out", is_loss=True)
                 continue
             self.counts[channel.id] += 1
             if is_wanted(channel):

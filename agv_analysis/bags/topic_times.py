@@ -35,7 +35,7 @@ class Periods(NamedTuple):
     period: float | None = None
     """Median [s]."""
     period_jitter: float | None = None
-    """Standard deviation of the periods that are no gaps [s]."""
+    """Standard deviation of the periods that are not gaps [s]."""
     longest_gap: float | None = None
     """Longest period [s]."""
     longest_gap_at: float | None = None

@@ -107,7 +107,7 @@ def with_force(command: F) -> F:
 
     return click.option(
         "--force", is_flag=True, is_eager=True, expose_value=False, callback=note,
-        help="Overwrite files that are no earlier outputs of this program.",
+        help="Overwrite files that this program did not write.",
     )(command)  # fmt: skip
 
 

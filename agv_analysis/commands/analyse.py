@@ -19,7 +19,7 @@ from agv_analysis.commands import (
 )
 
 
-@click.command("analyse")
+@click.command("analyse", short_help="Judge a recording: is the loop stable, and why?")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
 @click.option(

@@ -19,7 +19,7 @@ _LONG = 2**28
 """Bags of more bytes than this are read under a progress bar."""
 
 
-@click.group("bag")
+@click.group("bag", short_help="Inspect, export or recover recordings.")
 def command() -> None:
     """Inspect a recording, export it, or recover the intact messages of a damaged one.
 
@@ -33,7 +33,7 @@ _DEFINITIONS = click.option(
 )  # fmt: skip
 
 
-@command.command("info")
+@command.command("info", short_help="Show what a recording contains, and what is wrong with it.")
 @click.argument("bag", type=click.Path(path_type=Path))
 @_DEFINITIONS
 @click.option("--json", "json_file", type=OUTPUT, help="Write what is printed to this file, too.")
@@ -62,7 +62,7 @@ def info(bag: Path, definitions: Path | None, json_file: Path | None) -> None:
         write_json(json_file, summary.to_json())
 
 
-@command.command("export")
+@command.command("export", short_help="Write the messages as tables for other programs.")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--csv", "form", flag_value="csv", help="One CSV file for each topic, in the directory OUT.")
 @click.option("--parquet", "form", flag_value="parquet", help="One Parquet file for each topic, in the directory OUT.")
@@ -102,7 +102,7 @@ def _read(bag: Path, topics: tuple[str, ...], definitions: Path | None) -> Bag:
     return content
 
 
-@command.command("recover")
+@command.command("recover", short_help="Write every intact message to a clean bag.")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
 @_DEFINITIONS
@@ -126,7 +126,7 @@ def recover(bag: Path, out: Path, definitions: Path | None) -> None:
     _warn(recovery.problems, recovery.is_complete)
 
 
-@command.command("outages")
+@command.command("outages", short_help="Show which messages of a periodic topic are missing.")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--topic", required=True, help="Whose messages: of any type with a header, or of any other.")
 @click.option("--period", type=click.FloatRange(min=0.0, min_open=True), help="Time between messages sent [s].")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from agv_analysis.link.channel_study import ChannelStudy
 
 
-@click.command("channel")
+@click.command("channel", short_help="Show what a channel does to its messages, beside theory.")
 @with_settings
 @click.option("--link", type=click.Choice(["uplink", "downlink"]), default="uplink", help="Whose channel.")
 @click.option(

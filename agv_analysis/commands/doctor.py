@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from agv_analysis.doctor.timed_loop import TimedLoop
 
 
-@click.command("doctor")
+@click.command("doctor", short_help="Check this machine: versions, network, clocks, jitter.")
 @click.option(
     "--json", "json_file", type=OutputFile(allow_dash=True),
     help="Write the facts to this file, too; - prints them as JSON instead.",

@@ -7,7 +7,7 @@ import click
 from agv_analysis.commands import corridor_settings, with_settings
 
 
-@click.command("explore")
+@click.command("explore", short_help="Move sliders in the browser; each move simulates the lap.")
 @with_settings
 @click.option(
     "--corridor", "corridor_width", type=click.FloatRange(min=0.0, min_open=True), metavar="D",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from agv_analysis.recordings.robot_topics import RobotTopics
 
 
-@click.command("identify")
+@click.command("identify", short_help="Find a robot's dead time, lag, gain and slip in a recording.")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--pose-topic", help="The pose: Odometry, PoseWithCovarianceStamped, PoseStamped, or /tf.")
 @click.option("--pose-frames", nargs=2, metavar="FIXED ROBOT", help="Of /tf: which frames, as map base_link.")

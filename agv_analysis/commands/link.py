@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from agv_analysis.stability.through_link import ThroughLink
 
 
-@click.command("link")
+@click.command("link", short_help="Read a measured link: ping, irtt, a capture, a bag, ...")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("params", type=click.Path(), required=False)
 @click.option("--set", "settings", multiple=True, metavar="NODE.PARAMETER=VALUE", help="Change a parameter of PARAMS.")

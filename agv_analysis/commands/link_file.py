@@ -74,7 +74,7 @@ def read_link_file(file: Path, of_file: FileOptions) -> Reading:
     options = Options(of_file.interval, columns, of_file.delimiter, of_file.topic, of_file.received)
     if is_netem(str(file)) and not os.path.exists(file):  # noqa: PTH110  # Path.exists minds what is too long for a name
         if given := of_file.given():
-            raise MeasurementError(f"{given}, but {str(file)!r} is no file: it is a line for netem")
+            raise MeasurementError(f"{given}, but {str(file)!r} is not a file: it is a line for netem")
         return setting(str(file), "the command line")
     if not file.is_file() or file.stat().st_size < _LONG:
         return read_link(file, options, name)

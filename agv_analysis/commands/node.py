@@ -8,7 +8,11 @@ from agv_analysis.commands import needs_ros
 from agv_analysis.runtime.executables import NODE_MODULES, run_node_of
 
 
-@click.command("node", context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})
+@click.command(
+    "node",
+    short_help="Run one node, as `ros2 run` does.",
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+)
 @click.argument("name", type=click.Choice(list(NODE_MODULES)), metavar="NAME")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def command(name: str, arguments: tuple[str, ...]) -> None:

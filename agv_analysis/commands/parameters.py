@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 
-@click.command("parameters")
+@click.command("parameters", short_help="List all parameters as a table in Markdown.")
 def command() -> None:
     """List every parameter with its unit, default, allowed values and meaning, as a table in Markdown."""
     click.echo(markdown(), nl=False)

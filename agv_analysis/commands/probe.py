@@ -12,7 +12,7 @@ from agv_analysis.output_file import output_file
 from agv_ros.counted import counted
 
 
-@click.command("probe")
+@click.command("probe", short_help="Measure the link to another host.")
 @click.argument("host", required=False)
 @click.option("--listen", is_flag=True, help="Be the edge's end: answer one peer after another.")
 @click.option("--port", type=click.IntRange(1, 65535), default=47474, show_default=True, help="Of the edge's end, UDP.")
@@ -43,7 +43,7 @@ def command(
     from agv_analysis.link import link_probe
 
     if listen == (host is not None):
-        raise click.UsageError("either --listen, or the HOST that listens")
+        raise click.UsageError("give either --listen or the HOST that listens")
     try:
         if listen:
             answered, refused = link_probe.listen(port, peer=peer, seconds=seconds, ready=_say_ready)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from agv_analysis.simulation.edge_answers import Difference
 
 
-@click.command("replay")
+@click.command("replay", short_help="Play a recording to the edge again, or repeat its run.")
 @click.argument("bag", type=click.Path(path_type=Path))
 @click.option("--lockstep", is_flag=True, help="On DDS, each slot as soon as the one before is answered.")
 @click.option("--rate", type=click.FloatRange(min=0.0, min_open=True), help="On DDS, R times as fast as recorded.")
@@ -60,8 +60,8 @@ def command(
 
     on_dds = lockstep or rate is not None or edge == "running" or out is not None or not (compare or again or outages)
     _check(lockstep and rate is not None, "--lockstep and --rate exclude each other")
-    _check(again and (on_dds or compare), "--again is a run of its own, without --compare, --rate, --lockstep, --bag")
-    _check(ros and not again, "--ros belongs to --again; --rate and --lockstep are on DDS anyway")
+    _check(again and (on_dds or compare), "--again cannot go with --compare, --rate, --lockstep or --bag")
+    _check(ros and not again, "--ros needs --again; --rate and --lockstep use DDS without it")
     _check(json_file is not None and not (compare or again), "--json belongs to --compare or --again")
     _check(bool(settings) and not (compare or again or on_dds), "--set belongs to a replay, --compare or --again")
     _check(bool(settings) and edge == "running", "--set cannot change nodes that run already: use `ros2 param set`")

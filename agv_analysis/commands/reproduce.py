@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from agv_analysis.reproduce.runs import Runs
 
 
-@click.command("reproduce")
+@click.command("reproduce", short_help="Reproduce the paper's figures and claims.")
 @click.option(
     "--out", type=click.Path(path_type=Path), default=Path("paper"), show_default=True,
     help="Directory for figures, their data and the tables.",
@@ -44,7 +44,7 @@ def command(out: Path, ros: bool) -> None:
     except OSError as error:
         raise UserError(f"{out}: cannot be made: {error.strerror}") from None
     if any(out.iterdir()) and not is_forced() and not is_ours(out / report.CLAIMS_FILE):
-        raise UserError(f"{out}: is not empty and holds no earlier result: name another directory, or give --force")
+        raise UserError(f"{out}: is not empty and contains no earlier result: name another directory, or give --force")
     runs = _runs(out, ros)
     click.echo(CITATION)
     with Console(stderr=True).status("driving the paper's runs ..."):

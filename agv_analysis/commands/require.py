@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from agv_analysis.scenario import Scenario
 
 
-@click.command("require")
+@click.command("require", short_help="List what the loop asks of its radio.")
 @with_settings
 @click.option("--corridor", type=click.FloatRange(min=0.0, min_open=True), help="Stay within so much [m] as well.")
 @click.option("--corridor-along", type=click.FloatRange(min=0.0, min_open=True), help="So much [m] along the track.")

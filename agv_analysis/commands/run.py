@@ -22,7 +22,7 @@ PITCH = 20.0
 """Distance [m] of the tracks of two neighbours in a fleet: the paper's track is 18.07 m wide."""
 
 
-@click.command("run")
+@click.command("run", short_help="Run the loop, or a fleet of loops, on DDS.")
 @with_settings
 @click.option("--bag", type=click.Path(path_type=Path), help="Record to this directory, which must not exist.")
 @click.option("--fsync", is_flag=True, help="Have the disk write each chunk of the bag: for a loss of power.")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from agv_analysis.run import Run
 
 
-@click.command("simulate")
+@click.command("simulate", short_help="Simulate the loop without ROS.")
 @with_settings
 @with_corridor
 @click.option("--csv", "csv_file", type=OUTPUT, help="Write the run to this file, a row a step.")

@@ -32,7 +32,7 @@ _SEEDS = 20
 """Runs under the scenario's channel that the criteria are held against."""
 
 
-@click.command("stability")
+@click.command("stability", short_help="Find how many outages the loop tolerates, by each criterion.")
 @with_settings
 @with_corridor
 @click.option(
@@ -99,7 +99,7 @@ def command(
         _map(scenario, axes, points, csv_file or output_file("map.csv"), picture or output_file("map.png"), report)
         return
     if report is not None:
-        raise click.UsageError("--report is of a map: name its axes by --map; `simulate` reports on a run")
+        raise click.UsageError("--report needs --map with its two axes; `simulate --report` reports on a run")
     console = Console(highlight=False)
     seeds = range(scenario.relay.seed, scenario.relay.seed + _SEEDS)
     with Console(stderr=True).status("computing the margins ...") as status, ThreadPoolExecutor(1) as beside:
@@ -192,7 +192,7 @@ def _told(twins: Twins, seeds: range) -> str:
 def _best_gains(scenario: Scenario) -> tuple[dict[str, GainChoice], str]:
     """Best K_x by objective under the scenario's uplink, and why there is none.
 
-    None behind a predictor, for another law, for a channel that is no Markov chain or loses all.
+    None behind a predictor, for another law, for a channel that is not a Markov chain or loses all.
     """
     from agv_analysis.link.markov_channel import chain_of, why_no_chain
     from agv_analysis.stability.derived_loop import is_kanayamas_law

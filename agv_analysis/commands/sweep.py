@@ -24,7 +24,7 @@ _LONGEST_TABLE = 40
 """Points that fit on a screen."""
 
 
-@click.command("sweep")
+@click.command("sweep", short_help="Simulate a grid of parameters under many seeds.")
 @with_settings
 @with_corridor
 @click.option(
@@ -94,6 +94,8 @@ def command(
     settings = (*settings, *corridor_settings(corridor_width, corridor_along))
     sweep = Sweep(load_scenario(params, settings), tuple(map(parse_axis, axes)), seeds)
     sweep.check()
+    if not has_corridor(sweep) and (asked := [metric for metric in metrics if metric in CORRIDOR_COLUMNS]):
+        raise SweepError(f"--metric {asked[0]} needs a corridor: give its half-width by --corridor")
     store = None if out is None else Store(out, sweep, resume)
 
     def results(parts: list[Part]) -> Results:
@@ -128,7 +130,6 @@ def _write_rows(
     sweep: Sweep, rows: list[dict[str, Any]], metrics: tuple[str, ...], out: Path | None, suffix: str
 ) -> None:
     from agv_analysis.sweep.picture import can_draw, draw
-    from agv_analysis.sweep.plan import SweepError
     from agv_analysis.sweep.rows_file import write_rows
 
     if len(rows) <= _LONGEST_TABLE:
@@ -139,10 +140,9 @@ def _write_rows(
     click.echo(f"points:  {out / f'points.{suffix}'}")
     for metric in metrics if can_draw(sweep) else ():
         column = f"{metric}_p50" if metric in METRICS else metric
-        if column not in rows[0]:
-            raise SweepError(f"--metric {metric} is of a corridor: name one by --corridor")
-        draw(sweep, rows, column, out / f"{metric}.png")
-        click.echo(f"picture: {out / f'{metric}.png'}")
+        if column in rows[0]:  # a sweep that was interrupted has no figures of its corridor
+            draw(sweep, rows, column, out / f"{metric}.png")
+            click.echo(f"picture: {out / f'{metric}.png'}")
 
 
 def _write_reports(sweep: Sweep, rows: list[dict[str, Any]], report: Path | None, figures: Path | None) -> None:

@@ -10,7 +10,7 @@ import click
 from agv_analysis.commands import needs_ros
 
 
-@click.command("watch")
+@click.command("watch", short_help="Watch a running loop in the browser.")
 @click.option("--namespace", default="", help="Which loop, of several; a fleet's are agv_01, agv_02, ...")
 @click.option("--config", type=click.Path(path_type=Path), help="The loop's params file; else its nodes are asked.")
 @click.option("--plant-domain", type=click.IntRange(0, 232), help="DDS domain of the AGV, if not the usual one.")

@@ -114,7 +114,7 @@ class Corridor:
             yield "Outages within it", f"no answer: {self.reason}"
         else:
             yield "Longest single outage", self._single(self.single)
-            yield "Any outages up to n", self._any()
+            yield "Outages in any order", self._any()
             if self.tube_reason != _NOT_ASKED:
                 yield "The same, proved", self._proved()
         yield "RMS deviation", str(self.rms)
@@ -132,10 +132,10 @@ class Corridor:
 
     def _any(self) -> str:
         if self.n_any is None:
-            return f"no sequence found that leaves ({self.n_any_reason})"
+            return f"no sequence was found that leaves it ({self.n_any_reason})"
         if self.n_any < 0:
             return "none: the AGV is outside without any"
-        return f"no sequence found that leaves up to {counted(self.n_any, 'slot')}; {self.n_any_reason}"
+        return f"up to {counted(self.n_any, 'slot')} no sequence was found that leaves it; {self.n_any_reason}"
 
     def _proved(self) -> str:
         linear, nonlinear = self.linear_tube, self.nonlinear

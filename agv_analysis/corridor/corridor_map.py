@@ -82,8 +82,8 @@ def with_corridor(
 def best_point(found: MarginMap) -> str:
     """The point of a map that leaves its corridor most rarely, of equal ones that with the largest n_any, in words.
 
-    Where the uplink is no Markov chain that with the largest n_any. Empty without a corridor, or if all points leave it
-    without outages.
+    Where the uplink is not a Markov chain, that with the largest n_any. Empty without a corridor, or if all points
+    leave it without outages.
     """
     n_any, p_hour = found.margins.get(N_ANY), found.margins.get(P_HOUR)
     if n_any is None or (n_any < 0).all():

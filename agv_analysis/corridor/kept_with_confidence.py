@@ -89,7 +89,7 @@ def kept_with_confidence(
     """Of a scenario with a corridor. Raises UserError for one without, or for a confidence that laps cannot show."""
     widths = widths_of(scenario.error_detector)
     if widths is None:
-        raise UserError("a confidence is asked of a corridor: set error_detector.corridor, or --corridor")
+        raise UserError("--confidence needs a corridor: give --corridor, or set error_detector.corridor")
     if not 0.0 < confidence <= _MOST_OF_ALL:
         raise UserError(f"--confidence must be above 0 and at most 1 - 1e-12, got {confidence!r}")
     if confidence > MOST:

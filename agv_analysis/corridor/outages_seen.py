@@ -42,7 +42,7 @@ class RecordedOutages:
     left: int
     """Outages between whose beginning and that of the next the AGV was outside."""
     largest: float
-    """Largest share of the corridor that was used; inf where the AGV's pose is no number."""
+    """Largest share of the corridor that was used; inf where the AGV's pose is not a number."""
     at_most: float
     """Probability that an outage leads outside, at most: exact one-sided 95 % bound. 1 if there was no outage."""
     tail: Estimate | None

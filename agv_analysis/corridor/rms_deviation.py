@@ -19,6 +19,7 @@ from agv_analysis.corridor.stationary_deviation import StationaryDeviation
 from agv_analysis.json_values import finite
 from agv_analysis.link.channel_fit import Estimate
 from agv_analysis.link.markov_channel import Chain
+from agv_analysis.metrics.deviation import DIVERGED
 from agv_analysis.metrics.distance_text import metres
 
 FIRST_ORDER, SAMPLED, SIMULATED = (
@@ -107,6 +108,6 @@ def rms_deviation(
 
 
 def _with_interval(found: Estimate) -> str:
-    if found.low == found.high:
+    if found.low == found.high or not found.value <= DIVERGED:
         return metres(found.value)
     return f"{metres(found.value)} ({metres(found.low)} .. {metres(found.high)})"

@@ -26,7 +26,7 @@ def along_and_across(errors: Floats) -> tuple[Floats, Floats]:
 
 
 def shares_of(along: Floats, across: Floats, widths: Widths) -> Floats:
-    """How much of the corridor deviations use, any shape; NaN where they are no numbers."""
+    """How much of the corridor deviations use, any shape; NaN where they are not numbers."""
     return np.asarray(
         np.maximum(
             np.hypot(along, across) / widths.distance,
@@ -36,7 +36,7 @@ def shares_of(along: Floats, across: Floats, widths: Widths) -> Floats:
 
 
 def path_shares(pose: Floats, reference: Floats, widths: Widths) -> Floats:
-    """How much of the corridor a path uses at each step, shape (N,); inf where the AGV's pose is no number."""
+    """How much of the corridor a path uses at each step, shape (N,); inf where the AGV's pose is not a number."""
     with np.errstate(invalid="ignore", over="ignore"):
         found = shares_of(*path_deviation(pose, reference), widths)
     return np.where(np.isfinite(found), found, np.inf)

@@ -43,7 +43,7 @@ def deviation(motion: Motion, reference: ReferencePoint) -> tuple[float, float, 
 
 
 def share_of(along: float, across: float, widths: Widths) -> float:
-    """How much of the corridor a deviation uses: above 1 it is outside, inf where it is no number."""
+    """How much of the corridor a deviation uses: above 1 it is outside, inf where it is not a number."""
     share = max(
         math.sqrt(along * along + across * across) / widths.distance,
         abs(along) / widths.along,

@@ -28,7 +28,7 @@ def ports(domain: int, participants: int) -> dict[str, list[int]]:
 def discovery(environment: Mapping[str, str] = os.environ) -> dict[str, Any]:
     """Domain, discovery range and what else of the environment says where nodes look for each other.
 
-    `domain` is None if ROS_DOMAIN_ID is no number; ports are those of the first ten processes.
+    `domain` is None if ROS_DOMAIN_ID is not a number; ports are those of the first ten processes.
     """
     said = environment.get("ROS_DOMAIN_ID", "")
     domain = int(said or 0) if not said or said.isdecimal() else None

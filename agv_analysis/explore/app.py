@@ -20,7 +20,7 @@ from agv_analysis.explore.background_criteria import (
     compared_criteria_rows,
     tube_traces,
 )
-from agv_analysis.explore.guard import check_request, guard, said
+from agv_analysis.explore.guard import check_request, guard, listener, said
 from agv_analysis.explore.idle_controls import CONTROLS, idle_controls, idle_lines
 from agv_analysis.explore.page_layout import SHOWN_FOR_A_LAW, STYLE, layout, reason_text, styles_of
 from agv_analysis.explore.positions import difference, from_hash, position_of, to_hash, value_of
@@ -130,6 +130,11 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
         return *(one.key in idle for one in SLIDERS), *greyed, *reasons, idle_lines(scenario, now["more"])
 
     app.clientside_callback(_TO_URL, Output("in-url", "data"), Input("setting", "data"), prevent_initial_call=True)
+    app.clientside_callback(
+        _FORGET_EXPORT, Output("exported", "children", allow_duplicate=True),
+        Output("export-said", "children", allow_duplicate=True), Input("setting", "data"),
+        State("exported-of", "data"), prevent_initial_call=True,
+    )  # fmt: skip
     app.clientside_callback(_DRAWER, Output("drawer", "open"), Input("url", "pathname"))
 
     @app.callback(
@@ -177,11 +182,11 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
     )  # fmt: skip
 
     @app.callback(
-        Output("pinned", "data"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"), *states,
-        prevent_initial_call=True,
+        Output("pinned", "data"), Output("unpin", "disabled"), Input("pin", "n_clicks"), Input("unpin", "n_clicks"),
+        *states, prevent_initial_call=True,
     )  # fmt: skip
     def pin(_: Any, __: Any, *given: Any) -> Any:
-        return values(given) if dash.ctx.triggered_id == "pin" else None
+        return (values(given), False) if dash.ctx.triggered_id == "pin" else (None, True)
 
     @app.callback(
         *(Output(key, "value") for key in KEYS),
@@ -193,18 +198,19 @@ def _connect(dash: Any, app: Any, base: Scenario, criteria: CriteriaRows, tube: 
 
     @app.callback(
         Output("exported", "children"), Output("file", "data"), Output("export-said", "children"),
-        Input("export", "n_clicks"), *states,
-        prevent_initial_call=True,
+        Output("exported-of", "data"), Input("export", "n_clicks"), *states, prevent_initial_call=True,
     )  # fmt: skip
     def export(_: Any, *given: Any) -> Any:
+        now = values(given)
+        of = to_hash(now, at_first)
         try:
-            text = asked(values(given)).to_yaml()
+            text = asked(now).to_yaml()
         except UserError as error:
-            return said(error), dash.no_update, ""
+            return said(error), dash.no_update, "", of
         command = "agv-ncs simulate explored.yaml --report explored.html"
         shown = f"{command}\n\n# explored.yaml\n{text}"
         where = "explored.yaml is among your browser's downloads, and at the end of this page"
-        return shown, {"content": text, "filename": "explored.yaml"}, where
+        return shown, {"content": text, "filename": "explored.yaml"}, where, of
 
 
 def _mark(settings: Sequence[Any]) -> str:
@@ -239,6 +245,10 @@ _TO_URL = """function(text) {
 }"""
 """The address of the page holds its setting, and going back does not go through every move."""
 
+_FORGET_EXPORT = """(setting, exported) => exported == null || setting === exported
+  ? [dash_clientside.no_update, dash_clientside.no_update] : ["", ""]"""
+"""What was exported is shown as long as the page shows the setting of it."""
+
 _DRAWER = "function() { return innerWidth > 900; }"
 """On a phone the drawer is closed at first."""
 
@@ -254,15 +264,13 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
     werkzeug: Any = importlib.import_module("werkzeug.serving")
     lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections
     quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
-    try:
-        server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet)
-    except (OSError, SystemExit) as error:
-        raise UserError(f"port {port} of {HOST} cannot be used: {error}: choose another with --port") from None
-    guard(app.server, server.server_port)
+    with listener(HOST, port) as bound:  # the server has a copy of it
+        server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet, fd=bound.fileno())
+    guard(app.server, server.port)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     try:
-        ready(f"http://{HOST}:{server.server_port}{path}")
+        ready(f"http://{HOST}:{server.port}{path}")
         server.serve_forever()
     except KeyboardInterrupt:
         pass

@@ -62,6 +62,8 @@ pre { white-space: pre-wrap }
 }
 #pinned-name, #problem { height: 1.4em; overflow: auto; white-space: pre-wrap; font-size: .9rem; color: var(--soft) }
 #problem { color: var(--bad) }
+/* Where an answer takes a second, as when a vehicle is first compiled, the page still shows the one before. */
+#badge b[data-dash-is-loading=true], #summary[data-dash-is-loading=true] { opacity: .4; transition: opacity 0s 1s }
 #lap.old { opacity: .4 } h2:has(+ #lap.old)::after { content: ": computing …"; color: var(--soft) }
 .js-plotly-plot .main-svg text:not(.hovertext *) { fill: var(--ink) !important }
 .js-plotly-plot .gridlayer path { stroke: var(--line) !important }
@@ -100,7 +102,7 @@ def layout(dash: Any, at_first: dict[str, Any], idle: Mapping[str, str]) -> Any:
         html.Div(
             [
                 html.Button("Pin this setting", id="pin"),
-                html.Button("Unpin", id="unpin"),
+                html.Button("Unpin", id="unpin", disabled=True),
                 html.Button("Export", id="export"),
                 html.Span("", id="export-said"),
             ]
@@ -123,6 +125,7 @@ def layout(dash: Any, at_first: dict[str, Any], idle: Mapping[str, str]) -> Any:
         dcc.Store(id="tube"),
         dcc.Store(id="setting"),
         dcc.Store(id="in-url"),
+        dcc.Store(id="exported-of"),
         dcc.Location(id="url", refresh=False),
         dcc.Interval(id="again", interval=PAUSE, max_intervals=AGAIN),
     ]
@@ -183,7 +186,7 @@ def _labelled(dash: Any, slider: Slider, at_first: dict[str, Any], idle: Mapping
     options: dict[str, Any] = {}
     if slider.is_log:
         label += [": ", html.B(f"{value:g}", id=f"{slider.key}-value")]
-        options["allow_direct_input"] = False  # a position is no value
+        options["allow_direct_input"] = False  # a position is not a value
     moved = dcc.Slider(
         low, high, step, value=slider.position_of(value), marks=ends, id=slider.key, updatemode="drag",
         disabled=slider.key in idle,

@@ -14,7 +14,7 @@ _BY_KEY = {slider.key: slider for slider in SLIDERS}
 
 
 def position_of(key: str, value: Any) -> Any:
-    """Where a slider stands for a value; of what is no slider the value itself."""
+    """Where a slider stands for a value; of what is not a slider the value itself."""
     return _BY_KEY[key].position_of(value) if key in _BY_KEY else value
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agv_analysis.corridor.corridor import NOT_ALONE
 from agv_analysis.corridor.lap_loop import LapLoop
 from agv_analysis.corridor.single_outage import FEW_PLACES, LONGEST, roughly
 from agv_analysis.corridor.widths import Widths, widths_of
@@ -129,7 +130,7 @@ def _rough_outage(run: Run, widths: Widths) -> str:
     """Longest single outage within a corridor, from some places of the lap, in words."""
     relay = run.scenario.relay
     if not (relay.uplink.is_direct and relay.downlink.is_direct):
-        return "no answer: messages take time or depend on the place"
+        return f"no answer: {NOT_ALONE}"
     n = roughly(LapLoop(run.scenario, widths))
     if n is None:
         return f"any up to {LONGEST} slots, from {FEW_PLACES} places of the lap"

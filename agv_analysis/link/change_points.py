@@ -8,7 +8,7 @@ an outage, in random order: whatever the link, as long as it does not change the
 Where losses come more regularly than by chance, as every hundredth packet, all orders are nearly the same, and any is
 the largest by a hair. So the p-value is never below that of the likelihood ratio of a change at a known step, e^-gain.
 
-Segments are split anew as long as there is such a change (binary segmentation). One outage is no change of the link:
+Segments are split anew as long as there is such a change (binary segmentation). One outage is not a change of the link:
 the part that loses more must hold at least three.
 
 Source: Csoergo and Horvath, Limit Theorems in Change-Point Analysis, 1997, 1.2; Antoch and Huskova, Permutation Tests

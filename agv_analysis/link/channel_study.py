@@ -77,7 +77,7 @@ class ChannelStudy:
 
     @property
     def expected_age_shares(self) -> Floats | None:
-        """P(n_ul = j) in closed form, as long as `age_shares`; None for late messages and what is no Markov chain."""
+        """P(n_ul = j) in closed form, as long as `age_shares`; None for late messages or without a Markov chain."""
         if self.chain is None or self.channel.delays:
             return None
         return age_distribution(self.chain, len(self.age_shares))

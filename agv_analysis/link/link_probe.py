@@ -163,7 +163,7 @@ class _Edge:
             self._address, self._arrived, self._is_told = None, {}, True
 
     def reply(self, data: bytes, address: tuple[str, int], now_ns: int) -> bytes:
-        """What to answer; nothing to anybody but the peer, and nothing to what is no packet of a measurement."""
+        """What to answer; nothing to anybody but the peer, and nothing to what is not a packet of a measurement."""
         self.look(1e-9 * now_ns)
         if len(data) < _HEADER.size or data[:4] != _MAGIC:
             self.refused += 1

@@ -109,10 +109,10 @@ def shortest_mean_burst(loss_rate: float) -> float:
 
 
 def chain_of(channel: ChannelParameters) -> Chain | None:
-    """The chain of a channel's parameters; None for a model that is no Markov chain of at most `MOST_STATES` states.
+    """The chain of a channel's parameters; None for a model that is not a Markov chain of at most `MOST_STATES` states.
 
     A single outage (burst with a start_step) is over some day: to the long run the channel is perfect. What a schedule
-    changes is no chain, nor what is sent again.
+    changes is not a chain, nor what is sent again.
     """
     if channel.schedule or channel.reliable:
         return None
@@ -133,7 +133,7 @@ def why_no_chain(channel: ChannelParameters) -> str:
         return "is changed by its schedule"
     if channel.reliable:
         return "is reliable, so that its losses are late bursts"
-    return f"has more than {MOST_STATES} states" if channel.model == "burst" else "is no finite Markov chain"
+    return f"has more than {MOST_STATES} states" if channel.model == "burst" else "is not a finite Markov chain"
 
 
 def cycle_of(transition: Floats) -> NDArray[np.int64] | None:

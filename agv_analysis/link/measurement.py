@@ -1,7 +1,7 @@
 """A measured link: what became of each packet of a measurement, in each direction, and when.
 
 Every file format is read into one of three values. A `Measurement` knows packet by packet; `LossRates` know how many
-packets were lost in each interval, and no more; a `Setting` is no measurement but what somebody set an emulator to.
+packets were lost in each interval, and no more; a `Setting` is not a measurement but what somebody set an emulator to.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _SHOWN = 3
 
 
 class MeasurementError(UserError):
-    """A file that is no measurement of a link, or cannot say what it is asked; the text names it and the reason."""
+    """A file that is not a measurement of a link, or cannot say what it is asked; the text names it and the reason."""
 
 
 @dataclass
 class Malformed:
-    """Lines of a file that are no records of its format."""
+    """Lines of a file that are not records of its format."""
 
     count: int = 0
     shown: list[str] = field(default_factory=list)

@@ -158,7 +158,7 @@ def _check(first: int, last: int, records: int) -> None:
     if last - first + 1 > _SPARSE * records + _MOST_MISSING:
         raise NumbersError(
             f"numbers go from {first} to {last}, and {counted(records, 'packet has', 'packets have')} one: these "
-            "are no sequence numbers, or one "
+            "are not sequence numbers, or one "
             "of them is broken"
         )
 

@@ -1,4 +1,4 @@
-"""Loss rate and mean age of a link that is no Markov chain: parts of the recording, weighed anew at random.
+"""Loss rate and mean age of a link that is not a Markov chain: parts of the recording, weighed anew at random.
 
 The recording is cut at receptions into parts much longer than an outage, and each part gets a random weight: the
 Bayesian bootstrap, of blocks, because successive outages need not be independent.

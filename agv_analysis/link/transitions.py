@@ -6,7 +6,7 @@ which expects longer outages than Jeffreys' prior does: a recording that has not
 take them for short ones. A few outages outweigh either.
 
 An outage that is still open where the recording ends adds slots that did not recover and nothing else, which is what a
-censored observation is. Pairs of slots with a step missing between them are no transitions.
+censored observation is. Pairs of slots with a step missing between them are not transitions.
 
 Source: Anderson and Goodman, Statistical Inference about Markov Chains, Ann. Math. Stat. 28, 1957; priors: Brown, Cai
 and DasGupta, Interval Estimation for a Binomial Proportion, Stat. Science 16, 2001.

@@ -22,7 +22,7 @@ _TOGETHER = 32
 
 
 def not_exceeded(values: Floats, share: float) -> float:
-    """The smallest of some values >= 0, shape (n,), that a share of them do not exceed; inf where one is no number."""
+    """The smallest of some values >= 0, shape (n,), that a share of them do not exceed; inf where one is NaN or inf."""
     if not math.isfinite(values.max()):
         return math.inf
     large = values[values >= likely_below(values, share)]

@@ -43,8 +43,8 @@ def of_messages(on_steps: Mapping[str, OnSteps], names: Mapping[str, str]) -> It
     for topic, messages in on_steps.items():
         if messages.off_grid:
             yield (
-                f"{names[topic]}: {counted(messages.off_grid, 'message is', 'messages are')} no sampling "
-                "instant's, they are left out"
+                f"{names[topic]}: {counted(messages.off_grid, 'message is', 'messages are')} not at a sampling "
+                "instant: left out"
             )
         if messages.far:
             yield (

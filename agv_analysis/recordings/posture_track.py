@@ -86,7 +86,7 @@ def read_poses(bag: Bag, topic: str, what: str = "pose") -> Track:
 
 
 def yaws_of(messages: NDArray[np.void], path: str, member: str = "orientation") -> Floats:
-    """Yaw [rad] in (-pi, pi]; NaN where the quaternion is no rotation, as one whose w was never set.
+    """Yaw [rad] in (-pi, pi]; NaN where the quaternion is not a rotation, as one whose w was never set.
 
     It is the `member` of what is at `path`. Shape as that of the components.
     """
@@ -101,7 +101,7 @@ def yaws_of(messages: NDArray[np.void], path: str, member: str = "orientation") 
 def in_order(track: Track, where: str, topic: str) -> Track:
     """Only finite postures, each with a stamp later than all before it: an edge ignores what is older than it holds.
 
-    The stamp 0 is no time. Raises UserError if nothing is left, or if the clock was set meanwhile.
+    The stamp 0 means no time. Raises UserError if nothing is left, or if the clock was set meanwhile.
     """
     stamped = track.stamps != 0
     if not stamped.any():
@@ -123,7 +123,7 @@ def in_order(track: Track, where: str, topic: str) -> Track:
     repeated = np.count_nonzero(usable.stamps[1:] == newest[:-1])
     backwards = len(later) - np.count_nonzero(later) - repeated
     counts = (
-        (len(stamped) - np.count_nonzero(stamped), "stamps are 0, which is no time"),
+        (len(stamped) - np.count_nonzero(stamped), "stamps are 0, which means no time"),
         (np.count_nonzero(stamped & ~finite), "poses are not finite or have no orientation"),
         (repeated, "stamps repeat the one before"),
         (backwards, "stamps go backwards"),

@@ -56,8 +56,8 @@ def sent_commands(bag: Bag, topic: str, came: Track, wheelbase: float | None) ->
         instants = by_the_clock_of(came, messages[LOG_TIME])
     elif not instants.all():
         notes.append(
-            f"{topic}: {counted(int(np.count_nonzero(instants == 0)), 'stamp is', 'stamps are')} 0, which is no time, "
-            "their messages are left out"
+            f"{topic}: {counted(int(np.count_nonzero(instants == 0)), 'stamp is', 'stamps are')} 0, which means "
+            "no time, their messages are left out"
         )
         messages, instants = messages[instants != 0], instants[instants != 0]
     if prefix and (ahead := clock_ahead(bag, topic, came)):

@@ -29,7 +29,7 @@ _TICKS = (-1, 0, 1, 3, 10, 30, 100, 300, 1000, 3000, 10_000)
 _COLOURS = ("#2f6fdb", "#7b3fb5", "#0a8f6a", "#b8860b")
 
 _WORDS = {TS: "sampling period T_s", "v": "speed v of the reference", "curvature": "curvature of the track"}
-"""Of axes that are no gains."""
+"""Of axes that are not gains."""
 
 
 def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: str) -> None:

@@ -62,7 +62,7 @@ _TEXTS = ("name", "kind", "document", "table", "version")
 
 
 def load_classes(*files: Path) -> tuple[ServiceClass, ...]:
-    """The classes of this package and of further files. Raises UserError naming file and row for one that is no class.
+    """The classes of this package and of further files. Raises UserError that names file and row of a bad one.
 
     A file is a YAML list of rows, each with name, kind, document, table, version, read, and figures.
     """
@@ -73,7 +73,7 @@ def load_classes(*files: Path) -> tuple[ServiceClass, ...]:
         try:
             rows = yaml.safe_load(content)
         except (yaml.YAMLError, ValueError) as error:  # ValueError: a date that is none
-            raise UserError(f"{file}: is no YAML: {' '.join(str(error).split())}") from None
+            raise UserError(f"{file}: is not YAML: {' '.join(str(error).split())}") from None
         if not isinstance(rows, list):
             raise UserError(f"{file}: must be a list of classes, got {'nothing' if rows is None else repr(rows)[:80]}")
         for number, row in enumerate(rows, start=1):

@@ -244,7 +244,7 @@ class RecorderNode(LoopNode[RecorderParameters]):
         stamp_ns = diagnostics.header.stamp.sec * NS_PER_S + diagnostics.header.stamp.nanosec
         own = self.get_fully_qualified_name().lstrip("/")
         for status in diagnostics.status:
-            # What the recorder rejects, it says; it is no node that has to end before it does. Nor are others' nodes.
+            # What the recorder rejects, it says; it need not end before itself, nor need others' nodes.
             if status.name == own or status.name.rpartition("/")[0] != own.rpartition("/")[0]:
                 continue
             facts = {value.key: value.value for value in status.values}

@@ -54,7 +54,7 @@ class Difference:
     first: int | None
     """First step k that differs by more than TOLERANCE; None: none does."""
     first_size: float
-    """Difference at that step [m, rad] or [m/s, rad/s], 0 if none differs; inf: today's answer is no number."""
+    """Difference at that step [m, rad] or [m/s, rad/s], 0 if none differs; inf: today's answer is not a number."""
     largest: float
     largest_at: int
     """Step of the largest difference."""
@@ -63,7 +63,7 @@ class Difference:
 def sizes_of(apart: Floats) -> Floats:
     """Largest difference of each step over its components, shape (N,).
 
-    A computed answer that is no number, where the recording has one, differs without bound.
+    A computed answer that is not a number, where the recording has one, differs without bound.
     """
     return np.asarray(np.nan_to_num(np.abs(apart), nan=np.inf, posinf=np.inf).max(axis=1, initial=0.0))
 

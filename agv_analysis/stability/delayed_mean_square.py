@@ -37,7 +37,7 @@ MOST_WORK = 2e9
 """Numbers to be moved over a lap beyond which there is no answer: about ten seconds."""
 
 _WORK_OF_PREDICTED = 8.0
-"""So many times the work is a number of what a wrong model makes of late poses, which is no copy."""
+"""So many times the work is a number of what a wrong model makes of late poses, which is not a copy."""
 
 _STEPS_OF_CONSTANT = 1500
 """Steps, about, that are driven of a loop that is the same at every step."""

@@ -134,5 +134,5 @@ def distances(run: Run, twin: Run) -> Floats:
     """
     for name in ("k", "lost", "downlink_lost"):
         if not np.array_equal(getattr(run, name), getattr(twin, name)):
-            raise UserError(f"{run.source} and {twin.source} are no twins: they differ in {name}")
+            raise UserError(f"{run.source} and {twin.source} are not twins: they differ in {name}")
     return np.asarray(np.linalg.norm(run.pose - twin.pose, axis=1))

@@ -194,7 +194,7 @@ def _to_judge(scenario: Scenario) -> Scenario:
 
 
 def _under_links(common: Evidence, facts: RunFacts, judgements: Mapping[str, Judgement]) -> Evidence:
-    """With the growth under the links of a scenario; as a run of it shows them where one of them is no finite chain."""
+    """With the growth under the links of a scenario; as a run of it shows them where one is not a finite chain."""
     run, relay, plant = facts.run, facts.run.scenario.relay, facts.run.scenario.plant
     uplink, downlink = chain_of(relay.uplink), chain_of(relay.downlink)
     if facts.is_late and _constant_delay(facts) is None:
@@ -235,7 +235,7 @@ def _of_late_messages(common: Evidence, facts: RunFacts, judgements: Mapping[str
         growth = late.detail
         agree = all(half is not None and half * growth > 0.0 for half in growths_of_halves(facts))
         unsure = _left_open_by_losses(facts) if agree else "the halves of the run do not agree"
-        if has_late(run.downlink) and of_ages is not (growth < 0.0):  # ages that add up are no chain of their own
+        if has_late(run.downlink) and of_ages is not (growth < 0.0):  # ages that add up are not a chain of their own
             unsure = "the chain of ages and this sequence of ages do not agree"
         return _with_growth(common, growth, "late_and_lost", unsure)
     why = "messages were late, by no constant delay, which no criterion covers"

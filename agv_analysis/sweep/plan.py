@@ -58,7 +58,8 @@ def axis_of(name: str, values: Iterable[Any]) -> Axis:
     known = known_parameters()[node].get(parameter) if node in SCHEMAS else None
     if known is None:
         raise SweepError(
-            f"{name} is no parameter; expected node.parameter, as in controller.kx, with a node of {', '.join(SCHEMAS)}"
+            f"{name} is not a parameter; expected node.parameter, as in controller.kx, with a node of "
+            f"{', '.join(SCHEMAS)}"
         )
     plain = [value.item() if isinstance(value, np.generic) else value for value in values]
     if known.kind == "double":
@@ -83,7 +84,7 @@ def parse_axis(text: str) -> Axis:
             "or a list, as in relay.uplink.n=0,5,10"
         ) from None
     known = known_parameters()
-    parsed = [parse_setting(f"{name}={value}", known) for value in values]
+    parsed = [parse_setting(f"{name}={value}", known, "--vary") for value in values]
     node, parameter, _ = parsed[0]
     found = tuple(known[node][parameter].check(node, value) for _, _, value in parsed)
     if len(set(found)) < len(found):

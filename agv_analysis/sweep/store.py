@@ -91,7 +91,7 @@ def _compare(about: Path, description: dict[str, Any]) -> None:
     try:
         found = parse_json(about.read_bytes())
         if not isinstance(found, dict):
-            raise ValueError("it holds no object")  # as what is no JSON
+            raise ValueError("it holds no object")  # as what is not JSON
     except (OSError, ValueError) as error:
         raise SweepError(f"{about}: cannot be read: {error}") from None
     wanted = json.loads(json.dumps(description))

@@ -92,7 +92,7 @@ def best_point(rows: Rows) -> dict[str, Any]:
 
 
 def _where(name: str, rows: Rows) -> str:
-    """The values of the one axis at which the loop is stable; empty where they are no interval of numbers."""
+    """The values of the one axis at which the loop is stable; empty where they are not an interval of numbers."""
     if not all(isinstance(row[name], int | float) for row in rows):
         return ""
     rows = sorted(rows, key=lambda row: float(row[name]))

@@ -79,7 +79,7 @@ def metres(value: float) -> str:
 def _digits(value: float, decimals: int) -> str:
     """A number with so many decimals below ten, else with four digits."""
     if abs(value) < 10.0:
-        return f"{value:.{decimals}f}"
+        return f"{round(value, decimals) + 0.0:.{decimals}f}"  # and never -0.00
     return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.2g}"
 
 

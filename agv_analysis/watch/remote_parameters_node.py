@@ -111,7 +111,7 @@ class RemoteParameters:
         """Set a parameter of a node. Raises ParameterError if there is none, or the node refuses it or is silent."""
         known = parameters_of(SCHEMAS[node]).get(name)
         if known is None or not known.runtime:
-            raise ParameterError(f"{node}.{name} is no parameter that changes at run time")
+            raise ParameterError(f"{node}.{name} is not a parameter that changes at run time")
         if known.kind in ("double", "integer"):
             value = float(value) if known.kind == "double" else int(value)
         value = known.check(node, value)

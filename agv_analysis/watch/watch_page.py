@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from agv_analysis.explore.guard import THIS_HOST, guard
+from agv_analysis.explore.guard import THIS_HOST, guard, listener
 from agv_analysis.watch.watch_session import Edition, WatchSession
 from agv_ros.errors import UserError
 
@@ -76,7 +76,7 @@ def app_of(session: WatchSession, path: str) -> Any:
         if session.stop is None:
             return {"refused": "only a run that `agv-ncs run --live` has started can be stopped here"}, 409
         session.stop()
-        return {"said": "the run is asked to end"}
+        return {"said": "asked the run to end"}
 
     return app
 
@@ -115,16 +115,14 @@ def served(session: WatchSession, host: str, port: int) -> Iterator[str]:
     # With a buffer, which is flushed after each frame, a frame is sent in one call instead of four.
     lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1", "wbufsize": 1 << 16}
     quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
-    try:
-        server = werkzeug.make_server(host, port, app, threaded=True, request_handler=quiet)
-    except (OSError, SystemExit) as error:
-        raise UserError(f"port {port} of {host} cannot be used: {error}: choose another with --port") from None
+    with listener(host, port) as bound:  # the server has a copy of it
+        server = werkzeug.make_server(host, port, app, threaded=True, request_handler=quiet, fd=bound.fileno())
     server.daemon_threads = True
-    guard(app, server.server_port, (host, *(THIS_HOST if host in THIS_HOST else ())))
+    guard(app, server.port, (host, *(THIS_HOST if host in THIS_HOST else ())))
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()
     try:
-        yield f"http://{host}:{server.server_port}{path}"
+        yield f"http://{host}:{server.port}{path}"
     finally:
         server.shutdown()
         thread.join()

@@ -9,6 +9,6 @@ from agv_ros.pose import Pose
 def hold(held: Pose, target: Pose, reference: ReferencePoint) -> tuple[Pose, Pose]:
     """X_r(k) against X_c(k-n) (the paper's eq. 16).
 
-    Zero error is no equilibrium: the AGV runs ahead by v_r n T_s.
+    Zero error is not an equilibrium: the AGV runs ahead by v_r n T_s.
     """
     return held, Pose(reference.x, reference.y, reference.theta)

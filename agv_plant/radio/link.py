@@ -48,7 +48,7 @@ class Link(LinkCounts):
     def transmit(self, stamp_ns: int, message: bytes = b"", place: tuple[float, float] = NOWHERE) -> Passage:
         """The slot of the message with this stamp, sent when the AGV is at `place` [m].
 
-        Raises OffGridError if the stamp is no sampling instant but should be one.
+        Raises OffGridError if the stamp is not a sampling instant but should be one.
         """
         k = self._steps.of(stamp_ns)
         if k == 0:  # begins a run: whatever is held or under way of a run before it is past

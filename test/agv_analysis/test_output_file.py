@@ -77,7 +77,7 @@ def test_a_command_replaces_what_it_wrote_and_keeps_what_others_wrote(
         path.write_text("mine")
         status, said = agv_ncs(*asked)
         assert (status, path.read_text(), "Traceback" in said) == (1, "mine", False)
-        assert f"{path.name}: is no earlier output of agv-ncs and is kept" in " ".join(said.split())
+        assert f"{path.name}: was not written by agv-ncs and is kept" in " ".join(said.split())
         path.unlink()
     path.write_text("mine")
     assert agv_ncs(*asked, "--force")[0] == 0
@@ -105,7 +105,7 @@ def test_a_command_replaces_what_it_wrote_and_keeps_what_others_wrote(
 def test_what_is_no_earlier_output_is_kept(name: str, content: bytes, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(UserError, match=f"{name}: is no earlier output .* give --force"):
+    with pytest.raises(UserError, match=f"{name}: was not written by agv-ncs .* give --force"):
         output_file(path)
     path.write_bytes(b"")  # as mktemp makes it: nothing is lost
     assert output_file(path) == path
@@ -137,5 +137,7 @@ def test_the_paper_is_not_reproduced_into_a_directory_of_others(
     (tmp_path / "paper.tex").write_text("mine")
     status, said = agv_ncs("reproduce", "--out", tmp_path)
     assert status == 1
-    assert "is not empty and holds no earlier result: name another directory, or give --force" in " ".join(said.split())
+    assert "is not empty and contains no earlier result: name another directory, or give --force" in " ".join(
+        said.split()
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["paper.tex"]

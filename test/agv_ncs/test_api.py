@@ -137,8 +137,8 @@ def test_columns_of_a_sweep_have_its_shape(swept: agv_ncs.SweepResult, tmp_path:
 @pytest.mark.parametrize(
     ("name", "values", "complaint"),
     [
-        ("kx", [1.0], "kx is no parameter; expected node.parameter"),
-        ("controller.k", [1.0], "controller.k is no parameter"),
+        ("kx", [1.0], "kx is not a parameter; expected node.parameter"),
+        ("controller.k", [1.0], "controller.k is not a parameter"),
         ("controller.kx", [], "controller.kx: must have values, each once, got []"),
         ("controller.kx", [1.0, 1.0], "each once"),
         ("controller.kx", [-1.0], "controller.kx must be in [0, 1e+06], got -1.0"),

@@ -47,19 +47,19 @@ def format_of(path: Path, name: str = "") -> Format:
         if found.matches(head, path):
             return found
     known = "; ".join(found.title for found in FORMATS.values())
-    raise MeasurementError(f"{path}: is in no format that is known here ({known}); name it with --format if it is")
+    raise MeasurementError(f"{path}: unknown format, known are: {known}; if it is one of these, name it with --format")
 
 
 def read_link(path: str | Path, options: Options | None = None, name: str = "") -> Reading:
     """What a file says of a link, in the format called `name` or, without a name, in the one found by content.
 
-    Raises MeasurementError for a file that is no measurement of a link; the text says what it is, and what to do.
+    Raises MeasurementError for a file that is not a measurement of a link; the text says what it is, and what to do.
     """
     path, options = Path(path), options or Options()
     found = format_of(path, name or ("table" if options.columns or options.delimiter else ""))
     for option, (other, what) in _ABOUT.items():
         if getattr(options, option) and option not in found.takes:
-            raise MeasurementError(f"{path}: is no {other} ({found.title}), and {what}")
+            raise MeasurementError(f"{path}: is not a {other} ({found.title}), and {what}")
     try:
         return found.read(path, options)
     except NumbersError as error:

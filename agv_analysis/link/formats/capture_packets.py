@@ -61,7 +61,7 @@ def packets_of(path: Path, malformed: Malformed, progress: Progress | None) -> I
         try:
             reader = dpkt.pcap.UniversalReader(watched := _Watched(file))
         except (ValueError, dpkt.Error, struct.error) as error:
-            raise MeasurementError(f"{path}: is no capture: {error}") from None
+            raise MeasurementError(f"{path}: is not a capture: {error}") from None
         if hasattr(reader, "_divisor"):  # else its stamps are floats, which are exact to 0.2 us
             reader._divisor = Decimal(reader._divisor)
         decode, number = _decoder(dpkt, reader.datalink(), path), 0

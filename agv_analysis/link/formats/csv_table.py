@@ -11,7 +11,7 @@
 
 A name may end with its unit, as in `rtt_ms` or `RTT [ms]`; tshark's own names are known, and options name any others.
 The separator is a comma, a semicolon, a tabulator or a bar, whichever splits the header into most names, or blanks
-where it has none of these; --delimiter names another. Where it is no comma, a comma is a decimal mark. Lines that begin
+where it has none of these; --delimiter names another. Unless it is a comma, a comma is a decimal mark. Lines that begin
 with # are comments. A date without a unit that would be later than the year 5000 in seconds is one in ms, us or ns,
 which is said.
 """

@@ -33,7 +33,7 @@ def _read(path: Path, options: Options) -> LossRates:
         try:
             content = parse_json(file.read())
         except (ValueError, OSError) as error:
-            raise MeasurementError(f"{path}: is no whole JSON file: {error}") from None
+            raise MeasurementError(f"{path}: is not a whole JSON file: {error}") from None
     if not isinstance(content, dict):
         raise MeasurementError(f"{path}: is not iperf3's JSON")
     start = (content.get("start") or {}).get("test_start") or {}

@@ -229,7 +229,7 @@ _NEXT = re.compile(r'\}\s*,\s*(\{\s*"seqno")')
 
 
 def _trip(member: Any) -> Trip | None:
-    """What a member says; None if it is no round trip."""
+    """What a member says; None if it is not a round trip."""
     seqno = member.get("seqno") if isinstance(member, dict) else None
     if not isinstance(seqno, int) or not _is_number(seqno):
         return None

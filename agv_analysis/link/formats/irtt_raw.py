@@ -47,7 +47,7 @@ def _read(path: Path, options: Options) -> Measurement:
         duplicates += int(np.count_nonzero(is_numbered & again))
         table = table[is_numbered & ~again]
         found.add(table[:, 0].astype(np.int64), tuple(1e-3 * table[:, i] for i in (3, 2, 1)))
-    needs_packets(found.records, str(path), "line of a reply" if not duplicates else "reply that is no duplicate")
+    needs_packets(found.records, str(path), "line of a reply" if not duplicates else "reply that is not a duplicate")
     interval = options.interval or _USUAL_INTERVAL
     assumed = " between them, as --interval says" if options.interval else (
         " between them, irtt's usual, is assumed; say otherwise with --interval"

@@ -67,7 +67,7 @@ class Shapes:
     """The shapes of the members of a file, learned as they come."""
 
     def __init__(self, trip_of: Callable[[Any], Trip | None]) -> None:
-        """`trip_of`: what a member, decoded, says; None if it is no round trip."""
+        """`trip_of`: what a member, decoded, says; None if it is not a round trip."""
         self._trip_of = trip_of
         self._known: list[_Shape] = []
         self._arrays: _Arrays | None = None
@@ -250,7 +250,7 @@ def read_member(
 
 
 def after_blanks(text: Bytes, at: int) -> int:
-    """The first place from here on that is no blank."""
+    """The first place from here on that is not a blank."""
     while at < len(text) and text[at] <= 32:
         at += 1
     return at

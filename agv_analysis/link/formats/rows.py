@@ -48,7 +48,7 @@ _MOST_DIGITS = 19
 """Digits that an unsigned integer of 64 bits holds, whatever they are."""
 
 MOST_EXACT = 2.0**53
-"""Whole numbers below this are exact as floats: others are no sequence numbers."""
+"""Whole numbers below this are exact as floats: others are not sequence numbers."""
 
 _NOTHING = (b"", b"nan", b"na", b"n/a", b"null", b"none", b"-", b".", b"*", b"lost", b"timeout")
 """What stands for a number that is not there."""

@@ -58,7 +58,7 @@ class TableColumn(NamedTuple):
 
 
 class Header(NamedTuple):
-    """The first line of a table that is no comment."""
+    """The first line of a table that is not a comment."""
 
     separator: str
     names: list[str]

@@ -1,4 +1,4 @@
-"""The rows of a table, a block of lines at a time: its columns as numbers, and the lines that are no rows."""
+"""The rows of a table, a block of lines at a time: its columns as numbers, and the lines that are not rows."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def _margins(facts: ScenarioFacts) -> Iterable[Margin]:
         return
     reason = ""
     if uplink is None or downlink is None:
-        reason = "no answer: a channel is no finite Markov chain"
+        reason = "no answer: a channel is not a finite Markov chain"
     elif why := mean_square_downlink.why_not(plant):
         reason = f"no answer: {why}"
     if reason or uplink is None or downlink is None:

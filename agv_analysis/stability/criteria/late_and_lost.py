@@ -86,7 +86,7 @@ def growth_of_channel(loop: LinearLoop, relay: RelayParameters, ts: float) -> fl
         return "commands are late or lost as well"
     ages = age_chain_of(relay.uplink, ts)
     if ages is None:
-        return "losses with a memory and random delays, or a channel that is no finite Markov chain"
+        return "losses with a memory and random delays, or a channel that is not a finite Markov chain"
     loop = _thinned(loop, ages, _WORK_OF_CHANNEL, loop.steps)
     return _why_not(loop, ages) or delayed_mean_square.lap_growth(loop, ages) / loop.steps
 

@@ -340,7 +340,7 @@ def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
         read_bag(tmp_path / "bad.mcap")
     still_open = [str(link.readlink()) for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
     assert str(tmp_path / "bad.mcap") not in still_open
-    assert "is no MCAP file" in str(refusal.value)
+    assert "is not an MCAP file" in str(refusal.value)
 
 
 def test_a_topic_recorded_with_two_types_is_refused(tmp_path: Path) -> None:

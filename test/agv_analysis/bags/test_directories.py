@@ -240,7 +240,7 @@ def test_an_archive_is_refused_with_the_command_that_unpacks_it(
 
 def test_an_error_names_the_compressed_file_and_not_what_was_made_of_it(tmp_path: Path) -> None:
     (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(b"no bag at all, but long enough for it"))
-    with pytest.raises(BagError, match=f"^{tmp_path}/a.mcap.gz: is no MCAP file"):
+    with pytest.raises(BagError, match=f"^{tmp_path}/a.mcap.gz: is not an MCAP file"):
         read_bag(tmp_path / "a.mcap.gz")
 
 

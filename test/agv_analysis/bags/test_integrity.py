@@ -219,7 +219,7 @@ def test_a_cut_anywhere_leaves_exactly_the_whole_messages(
 
 @pytest.mark.parametrize("cut", range(8))
 def test_a_file_without_even_its_magic_is_refused(read: Callable[[bytes], Bag], cut: int) -> None:
-    with pytest.raises(BagError, match=r"damaged.mcap: is (empty|no MCAP file)"):
+    with pytest.raises(BagError, match=r"damaged.mcap: is (empty|not an MCAP file)"):
         read(write()[:cut])
 
 
@@ -490,7 +490,7 @@ def test_another_magic(read: Callable[[bytes], Bag]) -> None:
     refusals = {
         b"#ROSBAG V2.0\n" + bytes(100): "is a ROS 1 bag; `pip install rosbags && rosbags-convert --src",
         b"SQLite format 3\0" + bytes(100): "sqlite3 cannot open it: file is not a database",
-        whole[9:]: "is no MCAP file: begins with",
+        whole[9:]: "is not an MCAP file: begins with",
     }
     for content, why in refusals.items():
         with pytest.raises(BagError, match=why):
@@ -565,12 +565,12 @@ def test_rows_of_a_database_that_are_no_messages_cost_themselves_alone(tmp_path:
     assert not bag.is_complete
     assert len(bag["/agv/pose"]) == len(bag["/edge/slot"]) == STEPS
     assert len(bag["/clock"]) == STEPS - 3
-    assert "/clock: row that is no message, left out: 2" in bag.problems
+    assert "/clock: row that is not a message, left out: 2" in bag.problems
 
 
 @pytest.mark.parametrize(("mode", "log"), [("WAL", "-wal"), ("DELETE", "-journal")])
 def test_a_database_that_was_still_being_written(tmp_path: Path, mode: str, log: str) -> None:
-    """What was committed is read, what was not is no message yet; the files stay as they were."""
+    """What was committed is read, what was not is not a message yet; the files stay as they were."""
     path = database(tmp_path / "bag")
     insert = "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, 5, x'0001000001000000')"
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:

@@ -38,6 +38,16 @@ def test_help_shows_examples(agv_ncs: AgvNcs) -> None:
         assert "  agv-ncs " in said
 
 
+def test_the_list_of_commands_has_whole_sentences(agv_ncs: AgvNcs) -> None:
+    for group in ((), ("bag",)):
+        status, said = agv_ncs(*group, "--help")
+        listed = said.partition("Commands:\n")[2].splitlines()
+        assert status == 0
+        assert len(listed) >= 4
+        assert [line for line in listed if not line.endswith((".", "?")) or line.endswith("....")] == []
+        assert [line for line in listed if re.search(r"\w\.\.\.$", line)] == []
+
+
 def test_run_and_analyse(agv_ncs: AgvNcs, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs ROS 2: pip install '.[ros]'")
     bag, report = tmp_path / "bag", tmp_path / "report.json"

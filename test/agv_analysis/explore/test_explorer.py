@@ -31,6 +31,7 @@ from agv_analysis.explore.background_criteria import (
     criteria_rows,
     tube_traces,
 )
+from agv_analysis.explore.guard import listener
 from agv_analysis.explore.positions import from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
@@ -40,6 +41,7 @@ from agv_analysis.report.verdict_sentence import sentence
 from agv_analysis.scenario import load_scenario, parse_scenario
 from agv_analysis.simulation.single import simulate
 from agv_analysis.stability.analysis import analyse
+from agv_ros.errors import UserError
 from agv_ros.parameters import Parameter, ParameterError
 
 if TYPE_CHECKING:
@@ -198,6 +200,21 @@ def test_a_pinned_setting_has_margins_of_its_own_under_the_same_outages(base: Sc
     assert both["Any outages up to n"] == ("14 steps (70 ms)", "78 steps (390 ms)")
     alone = criteria_rows(slow)
     assert {name: other for name, (_, other) in both.items()} == dict(alone)
+
+
+def test_each_row_of_the_lap_has_a_name_of_its_own(base: Scenario) -> None:
+    """By which a pinned setting's value comes beside it."""
+    on_a_line = base.with_settings(["error_detector.corridor=0.25", "error_detector.track=line", "plant.duration=20.0"])
+    names = [name for name, _ in criteria_rows(on_a_line)]
+    assert len(names) == len(set(names))
+    assert {"Outages in any order", "Any outages up to n"} <= set(names)
+
+
+def test_what_diverges_has_no_metres(base: Scenario) -> None:
+    late = scenario_of(base, {**preset_values(base, "missed"), "more": "error_detector.corridor=0.25"})
+    rows = dict(criteria_rows(late))
+    assert rows["RMS deviation"].startswith("diverges in the simulated laps")
+    assert not [value for value in rows.values() if re.search(r"e\+\d+ m\b", value)]
 
 
 def test_the_losses_of_a_run_are_judged_as_the_analysis_does(base: Scenario) -> None:
@@ -396,9 +413,39 @@ def test_a_law_brings_its_own_sliders(page: Page) -> None:
     assert 2.0 < found.controller.gains[0] < 3.0
     assert found.controller.look_ahead == 0.49
     assert page.text("problem") == ""
+    assert "downloads" in page.text("export-said")
     choose(page, "law", "kanayama")
     page.until(lambda: shown() == ["gains-of-kanayama"])
+    page.until(lambda: page.text("exported") + page.text("export-said") == "")
     page.until(lambda: "Paper's test" in page.text("summary") and page.text("problem") == "")
+    assert complaints(page) == []
+
+
+def test_an_answer_that_takes_long_dims_what_is_of_the_setting_before(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    from selenium.webdriver.common.keys import Keys
+
+    from agv_analysis.explore import app
+
+    def opacity() -> str:
+        script = "return getComputedStyle(document.getElementById('badge-deviation')).opacity"
+        return str(page.chrome.execute_script(script))
+
+    released = threading.Event()
+
+    def respond_once_released(*settings: Any) -> Any:
+        released.wait(300.0)
+        return respond(*settings)
+
+    assert opacity() == "1"
+    monkeypatch.setattr(app, "respond", respond_once_released)
+    page.slider("kx").send_keys(Keys.PAGE_UP)
+    page.until(lambda: opacity() == "0.4")
+    released.set()
+    page.until(lambda: opacity() == "1" and "up to 14 along" not in page.text("summary"))
     assert complaints(page) == []
 
 
@@ -449,8 +496,10 @@ _MARK_SHOWN = "document.querySelector('#plot-track .js-plotly-plot').layout.meta
 def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     page.click("preset-missed")
     page.until(lambda: "13 steps (65 ms)" in page.text("summary"))
+    assert not page.chrome.find_element("id", "unpin").is_enabled()
     page.click("pin")
     page.until(lambda: "pinned" in page.names("track"))
+    assert page.chrome.find_element("id", "unpin").is_enabled()
     page.click("preset-predicted")
     page.until(lambda: "predicted: with an exact model" in page.text("summary"))
     head, errors = page.text("summary").splitlines()[:2]
@@ -465,6 +514,7 @@ def test_presets_and_pin_stand_beside_each_other(page: Page) -> None:
     assert page.text("pinned-name") == "Pinned, dotted: policy hold (now predict)"
     page.click("unpin")
     page.until(lambda: "pinned" not in page.names("time"))
+    page.until(lambda: not page.chrome.find_element("id", "unpin").is_enabled())
     assert complaints(page) == []
 
 
@@ -788,5 +838,13 @@ def test_a_port_that_is_taken_is_named(agv_ncs: Callable[..., tuple[int, str]]) 
         port = taken.getsockname()[1]
         status, said = agv_ncs("explore", "config/paper.yaml", "--port", str(port), "--no-browser")
     assert status == 1
-    assert f"port {port} of 127.0.0.1 cannot be used" in said
-    assert "Traceback" not in said
+    assert said == f"Error: port {port} of 127.0.0.1 cannot be used: Address already in use: choose another with --port"
+
+
+def test_an_address_of_another_machine_is_refused_with_the_remedy() -> None:
+    with pytest.raises(UserError, match=r"Cannot assign requested address: give --host an address of this machine$"):
+        listener("192.0.2.1", 0)
+    with pytest.raises(UserError, match=r"give --host an address of this machine$"):
+        listener("no.such.host.invalid", 0)
+    with listener("127.0.0.1", 0) as bound:
+        assert bound.getsockname()[1] > 0

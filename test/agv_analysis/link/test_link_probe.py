@@ -323,4 +323,4 @@ def test_the_command(tmp_path: Path, agv_ncs: AgvNcs) -> None:
     assert len(path.read_text().splitlines()) == 51
     status, said = agv_ncs("probe")
     assert status == 2
-    assert "either --listen, or the HOST that listens" in said
+    assert "give either --listen or the HOST that listens" in said

@@ -194,7 +194,7 @@ def test_what_tc_shows_as_json_is_what_it_shows_as_text(tmp_path: Path) -> None:
     assert found.differences == ("the qdisc tbf of eth0 acts on the link as well, and is left out here",)
     for other in ("[1, 2]", '[{"kind": "netem", "options": {"delay": 7, "loss-random": {"loss": "x"}}}]', "[", "[]"):
         path.write_text(other)
-        with pytest.raises(MeasurementError, match="is in no format that is known here"):
+        with pytest.raises(MeasurementError, match="unknown format, known are: "):
             read_link(path)
 
 

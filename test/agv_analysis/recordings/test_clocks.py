@@ -64,7 +64,7 @@ def recorded(
 
 def test_stamps_that_are_no_time_are_set_aside(tmp_path: Path) -> None:
     run = read_robot_run(recorded(no_stamp=slice(0, COUNT, 40)).write(tmp_path / "bag"), TOPICS)
-    assert any(note == "/odom: 10 stamps are 0, which is no time, their messages are left out" for note in run.notes)
+    assert any(note == "/odom: 10 stamps are 0, which means no time, their messages are left out" for note in run.notes)
     assert run.lost.sum() == 9  # those behind the first one that is there
     with pytest.raises(UserError, match="all its 400 stamps are 0, no time"):
         read_robot_run(recorded(no_stamp=slice(COUNT)).write(tmp_path / "never"), TOPICS)

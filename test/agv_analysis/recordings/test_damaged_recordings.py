@@ -82,7 +82,7 @@ X, W = 20, 68
 """Where x, and w of the quaternion, are in a PoseStamped of frame `map`."""
 
 NO_NUMBER = "with numbers that no node takes, they are left out"
-OFF_GRID = "/agv/pose: 8 messages are no sampling instant's, they are left out"
+OFF_GRID = "/agv/pose: 8 messages are not at a sampling instant: left out"
 COMMAND_V, ERROR_X = 28, 44
 """Where v is in a TwistStamped of frame `base_link`, and x_e in an Odometry of `base_link` and `reference`."""
 

@@ -191,7 +191,7 @@ def test_messages_off_the_grid_are_mentioned(tmp_path: Path) -> None:
         return [data[:4] + struct.pack("<iI", sec, nanosec + 1) + data[12:]]
 
     run = read_run(changed_bag(tmp_path / "bag.mcap", shift))
-    assert any("/edge/cmd_vel: 1 message is no sampling instant's" in note for note in run.notes)
+    assert any("/edge/cmd_vel: 1 message is not at a sampling instant" in note for note in run.notes)
     assert np.isnan(run.command[10]).all()
     assert run.unexplained == {"edge/cmd_vel": 1}
 

@@ -87,6 +87,6 @@ def test_a_map_says_no_probability_that_floats_round_to_certainty(
 def test_a_page_without_a_map_is_refused(agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     status, said = agv_ncs("stability", "config/paper.yaml", "--report", tmp_path / "map.html")
     assert status == 2
-    assert "--report is of a map" in said
+    assert "--report needs --map" in said
     with pytest.raises(FileNotFoundError):
         (tmp_path / "map.html").read_text()

@@ -338,7 +338,7 @@ def test_a_hostile_recording_is_text_in_its_report(
     chromium.find_element("css selector", "#of-parameters summary").click()
     shown = chromium.execute_script("return document.body.innerText")
     # the topic's name in a note, the parameter, the file's name; nothing else of the recording is in the page
-    assert f"/{HOSTILE}/agv/pose: 5 messages are no sampling instant's" in shown
+    assert f"/{HOSTILE}/agv/pose: 5 messages are not at a sampling instant" in shown
     parameters = yaml.safe_load(chromium.find_element("id", "parameters").text)
     assert parameters["error_detector"]["ros__parameters"]["track_file"] == HOSTILE
     assert bad.name in shown

@@ -236,8 +236,8 @@ def test_a_row_without_a_source_is_refused(tmp_path: Path) -> None:
     [
         ("", "must be a list of classes, got nothing"),
         ("name: x", "must be a list of classes, got {'name': 'x'}"),
-        ("{", "is no YAML: while parsing a flow node"),
-        ("- {version: 2026-13-01}", "is no YAML: month must be in 1..12"),
+        ("{", "is not YAML: while parsing a flow node"),
+        ("- {version: 2026-13-01}", "is not YAML: month must be in 1..12"),
         ("- 7", "class 1: must have names and values, got 7"),
     ],
 )
@@ -341,4 +341,4 @@ def test_a_line_for_netem_is_no_file(agv_ncs: AgvNcs) -> None:
     for command in (("link", "loss 5%"), ("require", "config/outages.yaml", "--link", "loss 5%")):
         status, said = agv_ncs(*command, "--topic", "/edge/pose", "--interval", "0.02")
         assert (status, len(said.splitlines())) == (1, 1)
-        assert " are about the file of a measured link, but 'loss 5%' is no file" in said
+        assert " are about the file of a measured link, but 'loss 5%' is not a file" in said

@@ -126,7 +126,7 @@ DIVERGING = (
 def test_a_loop_that_leaves_the_range_of_numbers_ends_there_and_says_so() -> None:
     run = run_of(*DIVERGING)
     assert np.isfinite(run.pose).all()
-    # The error grows by |1 - T_s K_x| = 9 a step, from 5 m to where ten times it, the way of one step, is no number.
+    # The error grows by |1 - T_s K_x| = 9 a step, from 5 m to where ten times it, the way of one step, is not a number.
     assert len(run) == math.ceil(math.log(sys.float_info.max / 50.0) / math.log(9.0)) + 1
     assert run.notes == (f"the loop diverged: after step {len(run) - 1} of 500 the AGV's pose is no longer finite",)
     found = convergence(run)

@@ -124,7 +124,7 @@ def test_a_wrong_speed_behind_a_predictor_by_the_predicted_error_alone(n: int, d
 
 
 def test_long_delays_behind_a_predictor_keep_no_modes_of_the_model() -> None:
-    """The model's own modes (an AGV moves on forever) are no modes of the loop: here they would hide all others.
+    """The model's own modes (an AGV moves on forever) are not modes of the loop: here they would hide all others.
 
     Along a line z^n (z - 1 + a) + a delta, n = 400.
     """

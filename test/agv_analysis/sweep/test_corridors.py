@@ -45,3 +45,4 @@ def test_a_metric_of_a_corridor_needs_one(agv_ncs, tmp_path) -> None:  # type: i
     )  # fmt: skip
     assert status == 1
     assert "--corridor" in said
+    assert not (tmp_path / "out").exists()  # before anything is simulated

@@ -72,6 +72,7 @@ def test_an_axis_is_a_range_or_a_list(text: str, values: tuple[object, ...]) -> 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ("controller.kx=a,b", "^--vary controller.kx=a: controller.kx is a double"),
         ("controller.kx=5:400", "has 2 parts; expected node.parameter=first:last:count"),
         ("controller.kx=5:400:1", "has 1 values, must be 2 to 10000"),
         ("controller.kx=5:inf:3", "not finite"),
@@ -370,7 +371,7 @@ def test_the_table_names_its_units_and_fits_80_columns(monkeypatch: pytest.Monke
 
 
 def test_the_table_of_corridors_names_its_units_and_says_never(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At K_x = 390 nothing settles; at 25 some 500 outages an hour lead outside: that one does is no certainty."""
+    """At K_x = 390 nothing settles; at 25 some 500 outages an hour lead outside: that one does is not a certainty."""
     monkeypatch.setenv("COLUMNS", "120")
     options = ["--set", "plant.duration=5.0", "--vary", "controller.kx=25,390", "--corridor", "0.25", "--laps", "20"]
     said = CliRunner().invoke(main, ["sweep", "config/outages.yaml", *options, "--no-verdicts"]).output

@@ -166,7 +166,7 @@ def test_a_relay_at_the_end_of_its_trace_ends(measured: Path, start: Start) -> N
     assert "the trace ends after 7 slots, and slot 7 is asked for" in said
 
 
-# -- JSON, and what is no trace ----------------------------------------------------------------------------------------
+# -- JSON, and what is not a trace -------------------------------------------------------------------------------------
 
 
 @settings(deadline=None, derandomize=True)

@@ -148,7 +148,7 @@ def test_stamps_of_a_capture_are_as_exact_as_it_has_them(tmp_path: Path, kind: s
 def test_a_capture_whose_unit_of_time_has_no_byte_is_refused(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "capture", [(10**18, frame(rtps(1)))], "pcapng")
     path.write_bytes(path.read_bytes().replace(struct.pack("<HHB3x", 9, 1, 9), struct.pack("<HHHH", 9, 0, 0, 0)))
-    with pytest.raises(MeasurementError, match="capture: is no capture: "):
+    with pytest.raises(MeasurementError, match="capture: is not a capture: "):
         read_link(path)
 
 
@@ -199,7 +199,7 @@ def test_many_keys_are_matched_as_few_are(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_capture_of_the_other_end_goes_with_a_capture(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("time,lost\n1,0\n2,1\n")
-    with pytest.raises(MeasurementError, match=r"is no capture .* and --received is a capture of the other end"):
+    with pytest.raises(MeasurementError, match=r"is not a capture .* and --received is a capture of the other end"):
         read_link(path, Options(received=path))
 
 

@@ -67,7 +67,7 @@ def test_an_option_about_another_kind_of_file_is_refused(
 ) -> None:
     path = tmp_path / "log"
     path.write_text("64 bytes from 10.0.0.2: icmp_seq=1 ttl=64 time=1 ms\n")
-    with pytest.raises(MeasurementError, match=rf"log: is no .* \(output of ping\), and {flag} "):
+    with pytest.raises(MeasurementError, match=rf"log: is not a .* \(output of ping\), and {flag} "):
         read_link(path, options, name)
 
 
@@ -331,7 +331,7 @@ def test_irtt_that_is_written_alike_reads_as_the_json_module_reads_it(
             trip = {**trip, "delay": {**delay, "rtt": 5.5e6}} if kind == 4 else {**trip, "odd": odd}
         trips.append(trip)
     text = json.dumps({"config": {"params": {"interval": 20_000_000}}, "round_trips": trips}, indent=indent)
-    text = text.replace('"seqno": 1500,', '"seqno": 01500,')  # which is no number of JSON
+    text = text.replace('"seqno": 1500,', '"seqno": 01500,')  # which is not a number of JSON
     monkeypatch.setattr(irtt_json, "_decoder", lambda: irtt_json._decode_as_json)
     expected = read(tmp_path / "a", text)
     monkeypatch.setattr(irtt_json, "_MANY", 0)

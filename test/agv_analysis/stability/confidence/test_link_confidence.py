@@ -139,7 +139,7 @@ def test_intervals_of_the_growth_cover(p: float, r: float, slots: int, most: flo
     assert 0.92 <= np.mean([low <= truth <= high for low, high in found]) <= most
 
 
-# -- links that change, repeat, or are no Gilbert channel --------------------------------------------------------------
+# -- links that change, repeat, or are no Gilbert channel -------------------------------------------------------------
 
 
 def test_the_worst_segment_decides() -> None:
