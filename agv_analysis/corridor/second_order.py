@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -54,8 +55,8 @@ from agv_ros.pose import Pose
 from agv_ros.substitution import replaced
 
 _PARTS, _MORE_PARTS = 300, 1000
-"""Parts of the lap for which the remainder is bounded, or of each of which it is measured where it begins; and for the
-last bounds, of a tube that holds."""
+"""Parts of the lap for which the remainder is bounded, or of each of which it is measured where it begins; and those
+for the last bounds, of a tube that holds the loop."""
 
 _SHARES = 4
 """F, shares of the way to a state: with one the remainder is twice what it need be, with many half more costs."""
@@ -69,7 +70,7 @@ _LEAST = 1e-9
 _TIMES = 1.2
 """Factor on the largest remainder that was measured."""
 
-_ATTEMPTS, _TOO_WIDE = 4, 1.2
+_ATTEMPTS, _TOO_WIDE = 3, 1.2
 """How many n are tried, and the share of the corridor by which the next n is chosen where the tube had no end."""
 
 
@@ -81,6 +82,10 @@ class NonlinearTube(NamedTuple):
     """Is what is of second order bounded, or was it measured?"""
 
 
+RemainderOf = Callable[[LapLoop, LinearLoop, Tube, Biases, int], Floats]
+"""`proved_remainder` or `measured_remainder`, of a tube, by so many parts of the lap."""
+
+
 def nonlinear_tube(loop: LapLoop, linear: LinearLoop, tube: Tube) -> NonlinearTube | None:
     """A tube as this one that covers what is of second order, too; its n may be a little smaller.
 
@@ -89,30 +94,38 @@ def nonlinear_tube(loop: LapLoop, linear: LinearLoop, tube: Tube) -> NonlinearTu
     if tube.n > LONG:
         return None
     bias = biases(loop, linear, tube.n)
-    for is_proved in (True, False):
-        n, inner = tube.n, tube
-        for _ in range(_ATTEMPTS):
-            try:
-                found = _with_remainder(loop, linear, inner, bias.up_to(n), is_proved)
-            except NoBoundsError:
-                break
-            share = _TOO_WIDE if found is None else found.largest_share
-            if found is not None and share <= 1.0:
-                return NonlinearTube(found, is_proved)
-            n = min(n - 1, int(shorter(n, share, linear.predicts)))
-            smaller = outer_tube(loop, linear, n, bias) if n >= 0 else None
-            if smaller is None:
-                break
-            inner = smaller
+    try:
+        found, is_proved = _of_fewer_slots(loop, linear, tube, bias, proved_remainder), True
+    except NoBoundsError:
+        found, is_proved = _of_fewer_slots(loop, linear, tube, bias, measured_remainder), False
+    return None if found is None else NonlinearTube(found, is_proved)
+
+
+def _of_fewer_slots(
+    loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Biases, remainder_of: RemainderOf
+) -> Tube | None:
+    """The tube with its remainder, of as many slots as this one or of some less; None if all leave the corridor."""
+    n, inner = tube.n, tube
+    for attempt in range(_ATTEMPTS):
+        found = _with_remainder(loop, linear, inner, bias.up_to(n), remainder_of)
+        share = _TOO_WIDE if found is None else found.largest_share
+        if found is not None and share <= 1.0:
+            return found
+        n = min(n - max(1, n // 12) * 2**attempt, int(shorter(n, share, linear.predicts)))
+        smaller = outer_tube(loop, linear, n, bias) if n >= 0 else None
+        if smaller is None:
+            return None
+        inner = smaller
     return None
 
 
-def _with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Biases, is_proved: bool) -> Tube | None:
+def _with_remainder(
+    loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Biases, remainder_of: RemainderOf
+) -> Tube | None:
     """The tube that adds to each b_i the remainder of its own states; None if there is no end to it.
 
-    `tube`: that of the linear loop. Raises NoBoundsError where there is none to be proved.
+    Or one with less than that which leaves the corridor already. `tube`: that of the linear loop.
     """
-    remainder_of = proved_remainder if is_proved else measured_remainder
     parts, finer = (1, 1) if linear.is_constant else (min(_PARTS, loop.steps), min(_MORE_PARTS, loop.steps))
     remainder, found = np.zeros((parts, tube.n + 2, ERRORS)), tube
     for _ in range(_ROUNDS):
@@ -120,13 +133,13 @@ def _with_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Biases,
         if not np.isfinite(needed).all():
             return None
         if (needed <= remainder).all():  # the loop stays within it, and so has no more than this
-            if is_proved:
-                needed = remainder_of(loop, linear, found, bias, finer)
+            if remainder_of is proved_remainder:  # measured at other places there may be more
+                needed = proved_remainder(loop, linear, found, bias, finer)
             return tube_with(loop, linear, tube.n, bias, np.maximum(needed, _LEAST)) or found
         remainder = np.maximum(remainder, np.maximum(_LEAST, _MORE * needed))
         wider = tube_with(loop, linear, tube.n, bias, remainder)
-        if wider is None:
-            return None
+        if wider is None or wider.largest_share > 1.0:
+            return wider
         found = wider
     return None
 
