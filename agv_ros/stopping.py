@@ -52,18 +52,20 @@ class Stop:
 def stop_on_signals() -> Iterator[Stop]:
     """Turn signals that end a process into a flag: a loop ends between two events, not in the middle of one.
 
-    A closed terminal sends SIGHUP, which `nohup` has a process ignore.
+    A closed terminal sends SIGHUP, which `nohup` has a process ignore. A process that ends with its starter has done
+    its work then: what it is asked while it exits does not change its status.
     """
     stop = Stop()
     heeded = [n for n in _STOP_SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, stop.request) for number in heeded}
-    if os.environ.get(ENDS_WITH_STDIN):
+    ends_with_starter = bool(os.environ.get(ENDS_WITH_STDIN))
+    if ends_with_starter:
         threading.Thread(target=_end_with_stdin, args=(stop,), daemon=True).start()
     try:
         yield stop
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_IGN if ends_with_starter else handler)
 
 
 def _end_with_stdin(stop: Stop) -> None:

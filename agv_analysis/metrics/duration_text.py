@@ -19,4 +19,4 @@ def duration_text(seconds: float, like: float | None = None) -> str:
 
 def outage_text(seconds: float) -> str:
     """How long an outage lasts, or how old a pose is [s]: in ms, if it is long in s."""
-    return f"{1e3 * seconds:.4g} ms" if seconds < 10.0 else f"{seconds:.4g} s"
+    return f"{1e3 * seconds:.4g} ms" if seconds < 2.0 else f"{seconds:.4g} s"

@@ -78,6 +78,10 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     plant, recorder = nodes["plant"], nodes.get("recorder")
     while plant.is_running(_LOOK_PERIOD) and not (stop.requested or any(map(_Process.is_ending, nodes.values()))):
         progress(plant.steps)
+    # One that is halted when the plant is done may go on while the plant waits for it.
+    while not plant.is_open() and any(map(_Process.is_halted, nodes.values())) and not stop.requested:
+        if not plant.is_running(_LOOK_PERIOD):
+            break
     ended = [node for node in nodes.values() if node.is_ending()]
     halted = [node for node in nodes.values() if node.is_halted()]
     is_cut_off = bool(halted) or any(node.killed_by for node in ended)
@@ -285,8 +289,8 @@ class _Process:
         return self._lines[-1] if self._lines else f"exit status {self.status}, without any output"
 
     def ask_to_end(self) -> None:
-        """Ask it to end in order, once, unless it does already."""
-        if not self._was_asked and self.is_open():
+        """Ask it to end in order, once."""
+        if not self._was_asked:
             self._was_asked = True
             self.hurry()
 

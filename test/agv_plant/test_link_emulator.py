@@ -68,7 +68,7 @@ class Radio:
         """Run callbacks until the condition holds; a minute is only there so that a hanging test ends."""
         deadline = time.monotonic() + 60.0
         while not condition():
-            assert time.monotonic() < deadline
+            assert time.monotonic() < deadline, self.emulator.facts()
             for executor in self._executors:
                 spin_for(executor, condition, 0.01 if len(self._executors) > 1 else 1.0)
 

@@ -46,4 +46,6 @@ def test_the_ends_of_an_interval_have_the_unit_of_its_middle() -> None:
 
 
 def test_long_outages_are_in_seconds() -> None:
-    assert (outage_text(0.14), outage_text(9.5), outage_text(99.995)) == ("140 ms", "9500 ms", "100 s")
+    assert (outage_text(0.14), outage_text(1.5), outage_text(9.5), outage_text(99.995)) == (
+        "140 ms", "1500 ms", "9.5 s", "100 s",
+    )  # fmt: skip
