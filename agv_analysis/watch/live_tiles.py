@@ -125,7 +125,8 @@ def _age(loop: LiveLoop) -> LiveTile:
     age = loop.latest("age")
     if math.isnan(age):
         return LiveTile("age", "Age of information", "not known", "")
-    return LiveTile("age", "Age of information", f"{age * loop.ts * 1e3:.0f} ms", f"{age:.0f} steps of {loop.ts:g} s")
+    steps = f"{counted(round(age), 'step')} of {loop.ts:g} s"
+    return LiveTile("age", "Age of information", f"{age * loop.ts * 1e3:.0f} ms", steps)
 
 
 def _speed(loop: LiveLoop) -> LiveTile:
