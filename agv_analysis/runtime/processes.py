@@ -289,8 +289,8 @@ class _Process:
         return self._lines[-1] if self._lines else f"exit status {self.status}, without any output"
 
     def ask_to_end(self) -> None:
-        """Ask it to end in order, once."""
-        if not self._was_asked:
+        """Ask it to end in order, unless it has been asked: a second time it would wait for nothing."""
+        if not (self._was_asked or self.stopped):
             self._was_asked = True
             self.hurry()
 
