@@ -249,11 +249,8 @@ def _box(tube: Tube, parts: _Parts) -> list[Interval]:
 def _on_the_way(nominal: Interval, box: Interval) -> Interval:
     """An error from the nominal one to as far as each share of the way to a state, shape (shares times parts,)."""
     to_state = Interval(np.minimum(box.low, 0.0), np.maximum(box.high, 0.0))
-    return Interval(*map(np.concatenate, zip(*(
-        (farther.low, farther.high)
-        for m in range(_SHARES)
-        for farther in [nominal + to_state * ((m + 1) / _SHARES)]
-    ), strict=True)))  # fmt: skip
+    reached = [nominal + to_state * ((m + 1) / _SHARES) for m in range(_SHARES)]
+    return Interval(np.concatenate([one.low for one in reached]), np.concatenate([one.high for one in reached]))
 
 
 def _repeated(of_parts: Interval) -> Interval:
