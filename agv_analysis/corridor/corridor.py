@@ -87,7 +87,7 @@ class Corridor:
     @property
     def tube(self) -> Tube | None:
         """The tube of the nonlinear loop where it is proved, else that of the linear one."""
-        return proving(self.linear_tube, self.nonlinear)
+        return _proving(self.linear_tube, self.nonlinear)
 
     @property
     def n_any_proved(self) -> int | None:
@@ -226,7 +226,7 @@ def corridor(
             tube, nonlinear, why_no_tube = _tubes(loop, _longest_any(single) if n_any is None else n_any)
     progress("laps")
     # Noise and slip are not part of what is proved.
-    covering = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else proving(tube, nonlinear)
+    covering = None if scenario.plant.is_noisy or scenario.plant.slip_noise > 0.0 else _proving(tube, nonlinear)
     n_proved = None if covering is None else covering.n
     found = leaving(loop, single, laps, lambda done: progress(counted(done, "lap")), n_proved)
     progress("the RMS deviation")
@@ -280,7 +280,7 @@ def _longest_any(single: SingleOutage) -> int:
     return _LONGEST_ANY if single.n is None else min(single.n, _LONGEST_ANY)
 
 
-def proving(linear: Tube | None, nonlinear: NonlinearTube | None) -> Tube | None:
+def _proving(linear: Tube | None, nonlinear: NonlinearTube | None) -> Tube | None:
     """The tube of the nonlinear loop where it is proved, else that of the linear one."""
     return nonlinear.tube if nonlinear is not None and nonlinear.is_proved else linear
 

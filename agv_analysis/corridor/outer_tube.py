@@ -77,6 +77,12 @@ class Template(NamedTuple):
         """A quarter of the polygon's sides."""
         return (len(self.directions) - 2) // 4
 
+    @property
+    def of_errors(self) -> tuple[tuple[int, int, float], ...]:
+        """Of x_e, y_e, theta_e: the directions along and against it, and how many metres one of it counts as."""
+        quarter = self.quarter
+        return (0, 1, 1.0), (2, 2 + 2 * quarter, 1.0), (2 + quarter, 2 + 3 * quarter, self.lever)
+
 
 @dataclass(frozen=True)
 class Tube:

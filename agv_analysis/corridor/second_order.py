@@ -237,10 +237,8 @@ class _Parts(NamedTuple):
 
 def _box(tube: Tube, parts: _Parts) -> list[Interval]:
     """Bounds of the deviations x_e, y_e, theta_e [m, m, rad] in a tube, over each part."""
-    quarter = tube.template.quarter
-    pairs = (0, 1, 1.0), (2, 2 + 2 * quarter, 1.0), (2 + quarter, 2 + 3 * quarter, tube.template.lever)
     found = []
-    for one, other, unit in pairs:
+    for one, other, unit in tube.template.of_errors:
         ahead, behind = parts.over(tube.bounds[:, one]), parts.over(tube.bounds[:, other])
         found.append(Interval(-behind.high / unit, ahead.high / unit))
     return found
@@ -273,13 +271,13 @@ def measured_remainder(loop: LapLoop, linear: LinearLoop, tube: Tube, bias: Bias
     Shape (parts, n + 2, 3). Of each part of the lap it is measured from where it begins, and holds for it and the one
     before.
     """
-    length, quarter = tube.n + 2, tube.template.quarter
-    every = -(-loop.steps // parts)
+    length, every = tube.n + 2, -(-loop.steps // parts)
     steps = np.arange(0, loop.steps, every)
     widest = np.maximum.reduceat(tube.bounds, np.unique(steps * len(tube.bounds) // loop.steps))
     widest = np.broadcast_to(widest, (len(steps), widest.shape[1]))
-    pairs = (0, 1, 1.0), (2, 2 + 2 * quarter, 1.0), (2 + quarter, 2 + 3 * quarter, tube.template.lever)
-    ahead, left, turned = (np.stack((widest[:, one], -widest[:, other])) / unit for one, other, unit in pairs)
+    ahead, left, turned = (
+        np.stack((widest[:, one], -widest[:, other])) / unit for one, other, unit in tube.template.of_errors
+    )
     identity = np.broadcast_to(np.eye(ERRORS), (len(steps), ERRORS, ERRORS))
     maps = np.stack((identity, *burst_maps(linear, length - 1, steps % len(linear.F))))
     pushed, found = bias.at(steps), np.zeros((len(steps), length, ERRORS))

@@ -79,9 +79,12 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     while plant.is_running(_LOOK_PERIOD) and not (stop.requested or any(map(_Process.is_ending, nodes.values()))):
         progress(plant.steps)
     # One that is halted when the plant is done may go on while the plant waits for it.
-    while not plant.is_open() and any(map(_Process.is_halted, nodes.values())) and not stop.requested:
-        if not plant.is_running(_LOOK_PERIOD):
-            break
+    while (
+        not (plant.is_open() or stop.requested)
+        and any(map(_Process.is_halted, nodes.values()))
+        and plant.is_running(_LOOK_PERIOD)
+    ):
+        pass
     ended = [node for node in nodes.values() if node.is_ending()]
     halted = [node for node in nodes.values() if node.is_halted()]
     is_cut_off = bool(halted) or any(node.killed_by for node in ended)
