@@ -16,6 +16,7 @@ from agv_cloud.control.registry import CONTROL_LAWS
 from agv_cloud.parameters import ControllerParameters
 from agv_ros.codec import decode_error, encode_command, encode_twist
 from agv_ros.executor import run_node
+from agv_ros.message_sync import MOST_WAITING
 from agv_ros.message_types import TWIST_STAMPED
 from agv_ros.messages import FRAME_AGV, Command, TrackingError
 from agv_ros.node import LoopNode
@@ -23,9 +24,6 @@ from agv_ros.parts import complaint
 from agv_ros.speeds_codec import SpeedsAhead, decode_speeds, encode_speeds
 from agv_ros.stamps import NS_PER_S
 from agv_ros.substitution import replaced
-
-_MOST_WAITING = 1000
-"""Errors and horizons that wait for each other at most."""
 
 
 class ControllerNode(LoopNode[ControllerParameters]):
@@ -106,7 +104,7 @@ class ControllerNode(LoopNode[ControllerParameters]):
         if stamp_ns in self._errors and stamp_ns in self._horizons:
             self._plan(self._errors.pop(stamp_ns), self._horizons.pop(stamp_ns))
         for waiting in (self._errors, self._horizons):
-            if len(waiting) > _MOST_WAITING:  # the other topic is dead
+            if len(waiting) > MOST_WAITING:  # the other topic is dead
                 del waiting[next(iter(waiting))]
 
     def _plan(self, error: TrackingError, horizon: SpeedsAhead) -> None:

@@ -110,6 +110,12 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
     def _on_clock_mode(self, mode: str) -> None:
         self._slots.limit_window(window_of(mode, self.settings.window_steps))
 
+    def on_stop(self, reason: str) -> None:
+        """What is under way is still answered; a clock of its own would go on for ever."""
+        super().on_stop(reason)
+        if self._timer is not None:
+            self._timer.cancel()
+
     def on_settings(self) -> None:
         """Parameters that were changed while the node runs."""
         self._detection.settings = self.settings

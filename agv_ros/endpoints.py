@@ -13,12 +13,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from agv_ros.errors import UserError
+from agv_ros.message_sync import MOST_WAITING
 from agv_ros.stamps import to_nanoseconds
 
 # Deep enough that a reader which falls behind for seconds, the recorder above all, still gets every message, even in
 # lockstep, where they are thousands a second. DDS sets memory aside only for messages that wait.
 # Only copies of it are used: rclpy writes a topic's overrides into the profile that it is given.
-LOOP_QOS = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
+LOOP_QOS = QoSProfile(depth=MOST_WAITING, reliability=ReliabilityPolicy.RELIABLE)
 
 RECORDER = "recorder"
 """Usual name of the node that records a loop."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import json
 import re
 import sys
 import time
@@ -25,7 +25,7 @@ from agv_ros.discovery import discovery_note
 from agv_ros.errors import UserError, open_text
 from agv_ros.node import LoopNode
 from agv_ros.service_manager import ALIVE, READY, STOPPING, notify, watchdog_period
-from agv_ros.stopping import CLOSED, ENDS_WITH_STDIN, Stop, stop_on_signals
+from agv_ros.stopping import CLOSED, COUNTS, Stop, ends_with_starter, stop_on_signals
 
 EXECUTORS: dict[str, Callable[..., Executor]] = {"events": EventsExecutor, "single": SingleThreadedExecutor}
 
@@ -64,6 +64,17 @@ def spin_for(executor: Executor, is_done: Callable[[], bool], seconds: float) ->
     return is_done()
 
 
+def spin_while_more_comes(
+    executor: Executor, is_done: Callable[[], bool], count: Callable[[], int], seconds: float
+) -> None:
+    """Run callbacks until `is_done`, or until `count` has not grown for so many `seconds`."""
+    before = -1
+    while count() > before:
+        before = count()
+        if spin_for(executor, is_done, seconds):
+            return
+
+
 def add(executor: Executor, node: LoopNode[Any]) -> None:
     """Let an executor run a node, in all DDS domains that it is in."""
     for side in (node, *node.sides):
@@ -83,7 +94,7 @@ def run_node(make: Callable[..., LoopNode[Any]], args: Sequence[str] | None = No
             if failure:
                 print(failure, file=sys.stderr, flush=True)
                 # Who stops a run, or has started it with others, knows why it ended, and waits for nothing.
-                if not (stop.requested or os.environ.get(ENDS_WITH_STDIN)):
+                if not (stop.requested or ends_with_starter()):
                     _say_on_rosout(_usual_name(make), failure, stop)
         finally:
             rclpy.try_shutdown()
@@ -145,11 +156,33 @@ def _run(make: Callable[..., LoopNode[Any]], stop: Stop) -> str:
     notify(STOPPING)
     if not node.finished:
         node.on_stop(stop.reason or "the end of its context")
+    if stop.requested:
+        _answer_what_is_under_way(executor, node, stop)
     deadline = time.monotonic() + (node.settings.stop_timeout if stop.requested else LAST_FLUSH_TIMEOUT)
     spin_for(executor, lambda: stop.insisted or node.is_settled(), deadline - time.monotonic())
     node.close()
+    if ends_with_starter():
+        print(_counts(node), flush=True)
     node.get_logger().info(f"{CLOSED}, waits until all that it has published has arrived")
     node.flush(max(0.0, deadline - time.monotonic()), lambda: stop.insisted)
     executor.shutdown()
     node.destroy_node()
     return node.failure
+
+
+def _answer_what_is_under_way(executor: Executor, node: LoopNode[Any], stop: Stop) -> None:
+    """Take part in the loop until the runner that started this node, if one did, lets it close.
+
+    The runner has ended the plant, and compares what its nodes say that they have received and published.
+    """
+    said = ""
+    while not (stop.may_close or stop.insisted):
+        if (counts := _counts(node)) != said:
+            said = counts
+            print(counts, flush=True)
+        spin_for(executor, lambda: stop.may_close or stop.insisted, SPIN_TIMEOUT)
+
+
+def _counts(node: LoopNode[Any]) -> str:
+    published = {output.topic: output.count for output in node.outputs}
+    return COUNTS + json.dumps({"received": node.received, "published": published})

@@ -16,6 +16,7 @@ No clock, no thread, no ROS in here: messages go in, pairs that are complete com
 
 from __future__ import annotations
 
+from collections import Counter, OrderedDict, deque
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -43,8 +44,11 @@ class Joined(Generic[M]):
     message: M | None
 
 
-MOST_WAITING = 1000
-"""Messages and slots that wait for each other at most."""
+MOST_WAITING = 20_000
+"""Messages and slots that wait for each other at most: as many as a subscription may have unread.
+
+An executor that has fallen behind takes all that one subscription has unread before it comes to the next one.
+"""
 
 
 class MessageSync(Generic[M]):
@@ -56,8 +60,9 @@ class MessageSync(Generic[M]):
 
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
-        self._arrived: dict[int, M | None] = {}
-        self._waiting: list[Slot] = []
+        self._arrived: OrderedDict[int, M | None] = OrderedDict()  # by stamp, the oldest first
+        self._waiting: deque[Slot] = deque()
+        self._named: Counter[int] = Counter()  # by how many of the waiting slots each stamp is named
         self._held: M | None = None
         self._settled_ns = 0
         self._last_slot_ns = 0
@@ -75,8 +80,14 @@ class MessageSync(Generic[M]):
         elif not self._is_ahead and self._is_known(message.stamp_ns):
             self.outdated += 1
             return []
-        self._arrived[message.stamp_ns] = message
-        return self._complete()
+        self._keep(message.stamp_ns, message)
+        return self._complete(message.stamp_ns)
+
+    def _keep(self, stamp_ns: int, message: M | None) -> None:
+        is_last = not self._arrived or stamp_ns > next(reversed(self._arrived))
+        self._arrived[stamp_ns] = message
+        if not is_last:
+            self._arrived = OrderedDict(sorted(self._arrived.items()))
 
     def _is_known(self, stamp_ns: int) -> bool:
         """Has this message been here, or a fresher one been used?"""
@@ -84,8 +95,9 @@ class MessageSync(Generic[M]):
 
     def reject(self, stamp_ns: int) -> list[Joined[M]]:
         """The message with this stamp came but cannot be used: its slot goes on with the message held before."""
-        self._arrived.setdefault(stamp_ns, None)
-        return self._complete()
+        if stamp_ns not in self._arrived:
+            self._keep(stamp_ns, None)
+        return self._complete(stamp_ns)
 
     def add_slot(self, slot: Slot) -> list[Joined[M]]:
         """Take a slot; returns it, and any before it, once the message that it names is here."""
@@ -99,34 +111,38 @@ class MessageSync(Generic[M]):
         elif slot.freshest_ns == 0 and self._held is not None:
             slot = slot._replace(freshest_ns=self._waiting[-1].freshest_ns if self._waiting else self._settled_ns)
         self._waiting.append(slot)
-        return self._complete()
+        self._named[slot.freshest_ns] += 1
+        return self._complete(slot.freshest_ns)
 
     def _restart(self) -> None:
         """Step 0 begins a run: nothing of a run before it is held."""
         if (self._last_slot_ns or self._waiting) and not self._is_ahead:
-            self._arrived = {ns: message for ns, message in self._arrived.items() if ns == self._start_ns}
+            self._arrived = OrderedDict((ns, one) for ns, one in self._arrived.items() if ns == self._start_ns)
         self._held, self._settled_ns, self._last_slot_ns, self._is_ahead = None, 0, 0, False
         self._waiting.clear()
+        self._named.clear()
 
-    def _complete(self) -> list[Joined[M]]:
+    def _complete(self, stamp_ns: int) -> list[Joined[M]]:
+        """The slots that can go on, now that the message with this stamp is here or a slot names it: no others can."""
         done: list[Joined[M]] = []
-        while (ready := self._first_ready()) is not None:
-            self.unanswered += ready
-            done.append(self._settle(self._waiting[ready]))
-            del self._waiting[: ready + 1]
+        while self._named[stamp_ns] and (stamp_ns == self._settled_ns or stamp_ns in self._arrived):
+            while (slot := self._next_slot()).freshest_ns != stamp_ns:
+                self.unanswered += 1
+            done.append(self._settle(slot))
         self._forget_what_waits_in_vain()
         return done
 
-    def _first_ready(self) -> int | None:
-        for i, slot in enumerate(self._waiting):
-            if slot.freshest_ns == self._settled_ns or slot.freshest_ns in self._arrived:
-                return i
-        return None
+    def _next_slot(self) -> Slot:
+        slot = self._waiting.popleft()
+        self._named[slot.freshest_ns] -= 1
+        if not self._named[slot.freshest_ns]:
+            del self._named[slot.freshest_ns]
+        return slot
 
     def _forget_what_waits_in_vain(self) -> None:
         """If one of the two topics is silent, the other must not fill the memory."""
         while len(self._waiting) > MOST_WAITING:
-            del self._waiting[0]
+            self._next_slot()
             self.unanswered += 1
         while len(self._arrived) > MOST_WAITING:
             del self._arrived[next(iter(self._arrived))]
@@ -137,9 +153,8 @@ class MessageSync(Generic[M]):
         if message is not None:
             self._held = message
         self._settled_ns = slot.freshest_ns
-        if self._arrived:
-            later = {ns: message for ns, message in self._arrived.items() if ns > slot.freshest_ns}
-            self.outdated += len(self._arrived) - len(later)  # overtaken before they were needed
-            self._arrived = later
+        while self._arrived and (oldest := next(iter(self._arrived))) <= slot.freshest_ns:
+            del self._arrived[oldest]
+            self.outdated += 1  # overtaken before it was needed
         self._last_slot_ns = slot.stamp_ns
         return Joined(slot, self._held)

@@ -15,10 +15,14 @@ STOPPED_BY = "stopped by "
 CLOSED = "closed"
 """Begins the line that a node logs when it has published its last message, and only waits until that has arrived."""
 
+COUNTS = "counts of messages: "
+"""Begins the line in which a node that its runner has asked to end says what it has received and published."""
+
 ENDS_WITH_STDIN = "AGV_NCS_ENDS_WITH_STDIN"
 """Environment variable: a process in which it is set ends when its standard input does.
 
-So who starts processes holds one end of a pipe each, which the system closes however that process ends.
+So who starts processes holds one end of a pipe each, which the system closes however that process ends. What is
+written to it lets a node that was asked to end publish its last message.
 """
 
 _ORPHAN_PATIENCE = 1.5
@@ -34,6 +38,8 @@ class Stop:
         self.requested = False
         self.insisted = False
         """Asked for again: nothing is waited for any more."""
+        self.may_close = not ends_with_starter()
+        """Has all been answered that is under way, as far as the one who started this process knows?"""
         self.reason = ""
         """What asked first, as in "SIGTERM"."""
 
@@ -58,20 +64,24 @@ def stop_on_signals() -> Iterator[Stop]:
     stop = Stop()
     heeded = [n for n in _STOP_SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, stop.request) for number in heeded}
-    ends_with_starter = bool(os.environ.get(ENDS_WITH_STDIN))
-    if ends_with_starter:
+    if ends_with_starter():
         threading.Thread(target=_end_with_stdin, args=(stop,), daemon=True).start()
     try:
         yield stop
     finally:
         for number, handler in before.items():
-            signal.signal(number, signal.SIG_IGN if ends_with_starter else handler)
+            signal.signal(number, signal.SIG_IGN if ends_with_starter() else handler)
+
+
+def ends_with_starter() -> bool:
+    """Does this process end with the one that started it?"""
+    return bool(os.environ.get(ENDS_WITH_STDIN))
 
 
 def _end_with_stdin(stop: Stop) -> None:
     """Body of a thread: once standard input ends, end this process, by force if need be."""
     while os.read(0, 4096):
-        pass
+        stop.may_close = True
     for _ in range(2):
         stop.ask("the end of the process that started it")
         time.sleep(_ORPHAN_PATIENCE)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,7 +29,7 @@ from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.progress_line import progress_line, progress_of
 from agv_ros.errors import UserError
 from agv_ros.parameters import as_dict
-from agv_ros.stopping import CLOSED, ENDS_WITH_STDIN, STOPPED_BY, Stop, stop_on_signals
+from agv_ros.stopping import CLOSED, COUNTS, ENDS_WITH_STDIN, STOPPED_BY, Stop, stop_on_signals
 
 _STOP_TIMEOUT = 20.0
 """How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
@@ -38,6 +39,12 @@ _SHORT_TIMEOUT = 0.8
 
 _HURRY_TIMEOUT = 1.0
 """How long [s] a process may take that was asked to stop for the second time."""
+
+_SILENCE = 7.0
+"""After this time [s] without any message, what is still under way was lost: DDS repeats every 3 s what was missed."""
+
+_SHORT_SILENCE = 0.1
+"""Likewise, where a process is gone or halted, to which messages are under way that no one will answer."""
 
 _SETTLED = 0.5
 """A file in shared memory that is younger than this [s] may belong to a process of another run that is starting."""
@@ -69,7 +76,7 @@ def run_in_processes(scenario: Scenario, bag: Path | None, progress: Progress, o
             outcome = _watch(nodes, stop, progress)
             return dataclasses.replace(outcome, recording=outcome.recording.removeprefix(f"{bag}: "))
         finally:
-            _end(nodes, stop, _STOP_TIMEOUT)
+            _end(nodes, stop, _STOP_TIMEOUT, _SHORT_SILENCE)
             _clean_up(nodes.values())
 
 
@@ -88,7 +95,8 @@ def _watch(nodes: dict[str, _Process], stop: Stop, progress: Progress) -> Outcom
     ended = [node for node in nodes.values() if node.is_ending()]
     halted = [node for node in nodes.values() if node.is_halted()]
     is_cut_off = bool(halted) or any(node.killed_by for node in ended)
-    _end(nodes, stop, _SHORT_TIMEOUT if is_cut_off else _STOP_TIMEOUT, in_order=not is_cut_off)
+    patience = (_SHORT_TIMEOUT, _SHORT_SILENCE) if is_cut_off else (_STOP_TIMEOUT, _SILENCE)
+    _end(nodes, stop, *patience)
     progress(plant.steps)
     recording = recorder.last_line() if recorder else ""
     failed = recorder is not None and recorder.status != 0
@@ -109,24 +117,43 @@ def _failure(plant: _Process, ended: Sequence[_Process], halted: Sequence[_Proce
     return "; ".join([*said, *(f"{node.name} is halted by a signal" for node in halted)])
 
 
-def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float, in_order: bool = False) -> None:
-    """End all nodes, the recorder, which has to hear of the others' end, last.
+def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float, silence: float) -> None:
+    """End all nodes: first the plant, then, once they have answered what is under way, the others, the recorder last.
 
-    `in_order`: one after the other as in the loop, so that each answers what the one before it has sent. The next one's
-    turn comes when a node has published its last message. Until that has arrived, all wait side by side: DDS asks for
-    an answer every 3 s only.
+    After so much `silence` [s] they are waited for no longer. Until what they have published has arrived, all wait side
+    by side: DDS asks for an answer every 3 s only.
     """
     loop, others = [nodes[name] for name in SCHEMAS if name in nodes], [nodes[n] for n in nodes if n not in SCHEMAS]
-    if not in_order:
-        _end_all(loop, stop, patience)
-        _end_all(others, stop, patience)
-        return
-    for node in (*loop, *others):
+    for node in loop:
+        if node.name == "plant":
+            node.let_close()
         node.ask_to_end()
-        deadline = time.monotonic() + patience
-        while node.is_open(_LOOK_PERIOD / 10) and not stop.insisted and time.monotonic() < deadline:
-            pass
+    _await_answers(loop, stop, silence)
+    for one in (*loop, *others):
+        one.let_close()
+    deadline = time.monotonic() + patience
+    while any(node.is_open(_LOOK_PERIOD / 10) for node in loop) and time.monotonic() < deadline:
+        if stop.insisted:
+            break
     _end_all([*loop, *others], stop, patience)
+
+
+def _await_answers(loop: Sequence[_Process], stop: Stop, silence: float) -> None:
+    """Wait until each node has received all that was published, or for so much `silence` [s] nothing more."""
+    newest, since = -1, time.monotonic()
+    while not stop.insisted and (open_ones := [node for node in loop if node.is_open()]):
+        published: Counter[str] = Counter()
+        for node in loop:
+            published.update(node.published)
+        is_known = all(node.received is not None for node in open_ones)
+        if is_known and all(node.has_received(published) for node in open_ones):
+            return
+        count = sum(sum((node.received or {}).values()) for node in loop)
+        if count != newest:
+            newest, since = count, time.monotonic()
+        elif time.monotonic() - since > silence:
+            return
+        time.sleep(_LOOK_PERIOD / 10)
 
 
 def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None:
@@ -221,6 +248,9 @@ class _Process:
         self.pace = Speedometer()
         self.stopped = ""
         """What it said when it was asked to end before it had done its work."""
+        self.received: dict[str, int] | None = None
+        """Messages by topic that it says have come; None before it was asked to end."""
+        self.published: dict[str, int] = {}
         self._has_closed = False
         self._was_asked = False
         self._lines: list[str] = []
@@ -246,6 +276,9 @@ class _Process:
                 self.stopped = text
             if text.startswith(CLOSED):
                 self._has_closed = True
+            elif text.startswith(COUNTS):
+                counts = json.loads(text.removeprefix(COUNTS))
+                self.received, self.published = counts["received"], counts["published"]
             elif steps is None or not text.startswith("step "):  # else it says no more than that
                 self._lines.append(text)
 
@@ -296,6 +329,16 @@ class _Process:
         if not (self._was_asked or self.stopped):
             self._was_asked = True
             self.hurry()
+
+    def let_close(self) -> None:
+        """Let it publish its last message, once it is asked to end and has nothing more to answer."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):  # it is gone
+            os.write(self._process.stdin.fileno(), b"\n")
+
+    def has_received(self, published: Mapping[str, int]) -> bool:
+        """Does it say that all has come of what was published?"""
+        return all(count >= published.get(topic, 0) for topic, count in (self.received or {}).items())
 
     def hurry(self) -> None:
         """Ask it to end, or, if it was asked before, to wait for nothing. One that is halted goes on for it."""

@@ -26,7 +26,7 @@ from agv_cloud.controller_node import ControllerNode
 from agv_cloud.error_detector_node import ErrorDetectorNode
 from agv_plant.plant_node import PlantNode
 from agv_plant.relay_node import RelayNode
-from agv_ros.executor import EXECUTORS, add, spin, spin_for
+from agv_ros.executor import EXECUTORS, add, spin, spin_while_more_comes
 from agv_ros.messages import Command, TrackingError
 from agv_ros.node import LoopNode
 from agv_ros.parameters import LoopParameters
@@ -181,14 +181,17 @@ def run_loops(executor: Executor, loops: Sequence[Loop], stop: Stop, progress: P
             loop.plant.close()
         # What the others have yet to answer would be missing from the bag.
         patience = max(node.settings.stop_timeout for node in nodes)
-        spin_for(executor, lambda: stop.insisted or _is_quiet(nodes), patience)
+        spin_while_more_comes(
+            executor, lambda: stop.insisted or _is_quiet(nodes), lambda: _received_by(nodes), patience
+        )
         deadline = time.monotonic() + PATIENCE
         for node in nodes:
             node.close()
         recorders = [(loop.recorder, len(loop.nodes)) for loop in loops if loop.recorder]
-        spin_for(
+        spin_while_more_comes(
             executor,
             lambda: stop.insisted or all(recorder.has_all_of(number) for recorder, number in recorders),
+            lambda: _received_by([recorder for recorder, _ in recorders]),
             PATIENCE,
         )
         for node in nodes:  # others may listen, too
@@ -206,6 +209,10 @@ def _is_quiet(nodes: Sequence[LoopNode[Any]]) -> bool:
         for output in node.outputs:
             published[output.topic] += output.count
     return all(node.has_received(published) for node in nodes)
+
+
+def _received_by(nodes: Sequence[LoopNode[Any]]) -> int:
+    return sum(node.received.total() for node in nodes)
 
 
 class _Watch:

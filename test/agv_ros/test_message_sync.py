@@ -51,8 +51,8 @@ class Schedule(NamedTuple):
 
     def answers(self) -> list[tuple[int, Message | None]]:
         """By definition: each slot with the last usable message up to it."""
-        usable = [max((j for j in range(k + 1) if self.fates[j] == "."), default=None) for k in range(len(self.fates))]
-        return [(t(k), None if j is None else Message(t(j), self.run)) for k, j in enumerate(usable)]
+        usable = [self.fates.rfind(".", 0, k + 1) for k in range(len(self.fates))]
+        return [(t(k), None if j < 0 else Message(t(j), self.run)) for k, j in enumerate(usable)]
 
 
 def feed(join: MessageSync[Message], event: Message | int | Slot) -> Iterator[tuple[int, Message | None]]:
@@ -208,6 +208,15 @@ def test_a_stray_rejected_message_does_no_harm(k: int) -> None:
             join.add_message(Message(t(3)))
             join.reject(t(k))
         assert [one.message for one in join.add_slot(Slot(t(step), t(step), DELIVERED))] == [Message(t(step))]
+
+
+@pytest.mark.parametrize("slots_first", [True, False])
+def test_all_that_a_subscription_may_have_unread_can_come_before_the_other_topic(slots_first: bool) -> None:
+    join, schedule = MessageSync[Message](START), Schedule("..x." * (MOST_WAITING // 4))
+    topics: list[list[Message | int | Slot]] = [[*schedule.messages()], [*schedule.slots()]]
+    events = [event for topic in (topics[::-1] if slots_first else topics) for event in topic]
+    assert [answer for event in events for answer in feed(join, event)] == schedule.answers()
+    assert (join.outdated, join.unanswered) == (0, 0)
 
 
 def test_a_dead_topic_does_not_let_the_other_fill_the_memory() -> None:
