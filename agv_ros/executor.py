@@ -35,7 +35,10 @@ SPIN_TIMEOUT = 0.05
 _ROSOUT_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 _ROSOUT_PATIENCE = 3.2
-"""How long [s] a process that fails looks for those who watch /rosout: DDS finds some only when it repeats itself."""
+"""How long [s] a process that fails looks for those who watch /rosout, and then waits until they have its message.
+
+DDS finds some only when it repeats itself, and repeats a message that somebody has missed, every 3 s.
+"""
 
 LAST_FLUSH_TIMEOUT = 10.0
 """How long [s] a node that finishes normally waits for subscribers that lag."""
@@ -136,7 +139,11 @@ def _say_on_rosout(name: str, failure: str, stop: Stop) -> None:
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
     stamp = TimeMessage(sec=seconds, nanosec=nanoseconds)
     publisher.publish(Log(stamp=stamp, level=Log.FATAL, name=name, msg=failure))
-    publisher.wait_for_all_acked(Duration(seconds=1))
+    deadline = time.monotonic() + _ROSOUT_PATIENCE
+    # A subscriber that is known here may not know of the publisher yet.
+    while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
+        if stop.requested or time.monotonic() > deadline:
+            break
     herald.destroy_node()
 
 
