@@ -75,7 +75,14 @@ class Radio:
     def publisher(self, kind: type, topic: str, qos: QoSProfile, on: Node | None = None) -> Any:
         """A publisher that the emulator hears."""
         publisher = (on or self.robot).create_publisher(kind, topic, qos)
-        self.until(lambda: publisher.get_subscription_count() > 0)
+
+        def is_connected() -> bool:
+            nodes = (self.emulator, *self.emulator.sides)
+            heard = [one for node in nodes for one in node.subscriptions if one.topic_name == publisher.topic_name]
+            is_known = any(one.get_publisher_count() for one in heard)
+            return is_known and publisher.get_subscription_count() > 0  # each of the other
+
+        self.until(is_connected)
         return publisher
 
     def received(self, kind: type, topic: str, qos: QoSProfile, on: Node | None = None) -> list[bytes]:
@@ -237,9 +244,7 @@ def test_two_domains_and_a_fleet_s_share_of_the_radio(radio: Make, two_domains: 
     """Names stay as they are, and nothing but the emulator joins the domains."""
     channel: dict[str, Any] = {"model": "shared", "vehicles": 3, "vehicle": 1, "blocks": 1}
     made = radio(two_domains, uplink__topics=["/image"], **{f"uplink__{name}": v for name, v in channel.items()})
-    came, images = None, made.robot.create_publisher(Image, "/image", RELIABLE)
-    made.until(lambda: images.get_subscription_count() > 0)
-    came = made.received(Image, "/image", RELIABLE)
+    images, came = made.publisher(Image, "/image", RELIABLE), made.received(Image, "/image", RELIABLE)
     for k in range(30):
         images.publish(Image(data=bytes(1000)))
         made.until(lambda k=k: made.emulator.topics[0].sent == k + 1)  # type: ignore[misc]
