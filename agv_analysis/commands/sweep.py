@@ -250,14 +250,22 @@ def _corridors(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:
     from agv_analysis.sweep.corridors import best_for_corridor
 
     best = best_for_corridor(sweep, rows)
-    table = _table(sweep, ("single\noutage", "any\noutages", _IN_A_LAP, "in an\nhour", "mean\ntime [s]", ""))
+    table = _table(sweep, ("single\noutage", "any\noutages", _IN_A_LAP, "in an\nhour", "mean time", ""))
     for row in rows:
         table.add_row(
             *(_plain(row[axis.name]) for axis in sweep.axes), f"{row['n_single']:g}", f"{row['n_any']:g}",
-            f"{row['p_lap']:.3g} ({row['p_lap_low']:.2g} .. {row['p_lap_high']:.2g})", computed(row["p_hour"]),
-            f"{row['mean_time_s']:.3g}", "most rarely" if row is best else "",
+            f"{row['p_lap']:.3g}\n({row['p_lap_low']:.2g} .. {row['p_lap_high']:.2g})", computed(row["p_hour"]),
+            _mean_time(row), "most rarely" if row is best else "",
         )  # fmt: skip
     return table
+
+
+def _mean_time(row: dict[str, Any]) -> str:
+    from agv_analysis.metrics.duration_text import duration_text
+
+    if math.isfinite(row["mean_time_s"]):
+        return duration_text(row["mean_time_s"])
+    return "not seen" if row["p_hour_high"] > 0.0 else "never"
 
 
 def _verdicts(sweep: Sweep, rows: list[dict[str, Any]]) -> Table:

@@ -18,7 +18,7 @@ from agv_analysis.report.sweep_table import number
 from agv_analysis.report.tiles import Tile
 from agv_analysis.run import Floats
 from agv_analysis.scenario import Scenario
-from agv_analysis.stability.margin_map import TS, MarginMap, axes_of, map_columns
+from agv_analysis.stability.margin_map import SPEED, TS, MarginMap, axes_of, map_columns
 from agv_analysis.sweep.picture import INSTABILITY_COLOURS
 from agv_cloud.control.registry import CONTROL_LAWS, KANAYAMA
 from agv_ros.counted import counted
@@ -49,7 +49,8 @@ def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: st
         data={
             "sentence": map_sentence(found, scenario), "axes": list(found.axes), "points": points,
             "titles": {**titles, found.axes[0]: up, found.axes[1]: across},
-            "settings": _settings(scenario), "parameters": parameters, "versions": versions(),
+            "settings": _settings(scenario), "speed": axes_of(scenario)[SPEED][0], "parameters": parameters,
+            "versions": versions(),
         },
         title="agv_ncs: map of margins",
         verdict=map_sentence(found, scenario),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.picture import INSTABILITY_COLOURS, across_and_up, border_colour, can_draw, draw
 from agv_analysis.sweep.plan import Axis, Sweep, varied
 from agv_analysis.sweep.sweep_sentence import Rows, best_point, is_calm, sweep_reason, sweep_sentence
-from agv_analysis.sweep.verdicts import words_said
+from agv_analysis.sweep.verdicts import NOT_GREEN, not_green, words_said
 from agv_ros.counted import counted
 from agv_ros.errors import UserError
 
@@ -150,6 +150,7 @@ def _curve(sweep: Sweep, axis: Axis, rows: Rows) -> dict[str, Any]:
     words = axis_words(axis, sweep.base)
     found = figure([Panel("instability", "Instability", words, "probability", lines, y_range=(-0.02, 1.02))])
     found["data"][0]["mode"] = "lines+markers"
+    found["data"] += _marks([(row[axis.name], row["instability"]) for row in not_green(rows)])
     for name, places in border_places(sweep.base, axis).items():
         if places:
             x_border = [x for place in places for x in (place, place, None)]
@@ -172,7 +173,18 @@ def _heat_map(sweep: Sweep, rows: Rows) -> dict[str, Any]:
         "<extra></extra>",
         "colorbar": {"title": {"text": "probability of instability", "side": "right"}, "thickness": 14},
     }  # fmt: skip
-    return {"data": [heat, *_borders(sweep, across, up)], "layout": heat_map_layout(*words)}
+    marks = _marks([(row[across.name], row[up.name]) for row in not_green(rows)])
+    return {"data": [heat, *_borders(sweep, across, up), *marks], "layout": heat_map_layout(*words)}
+
+
+def _marks(places: Sequence[tuple[float, float]]) -> Iterator[dict[str, Any]]:
+    """Points whose verdict is not green, whatever share of their runs was unstable."""
+    if places:
+        x, y = zip(*places, strict=True)
+        yield {
+            "type": "scatter", "mode": "markers", "name": NOT_GREEN, "x": list(x), "y": list(y), "hoverinfo": "skip",
+            "marker": {"symbol": "x-thin", "size": 9, "line": {"width": 2, "color": "#5f5f5f"}},
+        }  # fmt: skip
 
 
 def _borders(sweep: Sweep, across: Axis, up: Axis) -> Iterator[dict[str, Any]]:

@@ -13,6 +13,7 @@ from agv_analysis.report.matplotlib_figures import legend_above
 from agv_analysis.sweep.axis_words import axis_words
 from agv_analysis.sweep.borders import border_maps, border_places
 from agv_analysis.sweep.plan import Axis, Sweep, SweepError
+from agv_analysis.sweep.verdicts import NOT_GREEN, not_green
 from agv_ros.counted import counted
 
 if TYPE_CHECKING:
@@ -79,11 +80,17 @@ def _curve(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) ->
     if metric == "instability":
         low, high = ([row[f"instability_{end}"] for row in rows] for end in ("low", "high"))
         axes.fill_between(x, low, high, color="#1f6fb4", alpha=0.2, label="95 % confidence")
+        _mark(axes, [(row[axis.name], row[metric]) for row in not_green(rows)])
     for name, places in border_places(sweep.base, axis).items():
         for place in places:
             axes.axvline(place, color=border_colour(name), ls="--", label=f"border: {name}")
     axes.set(xlabel=axis_words(axis, sweep.base), ylabel=_title(metric))
     legend_above(axes)
+
+
+def _mark(axes: Axes, places: list[tuple[float, float]]) -> None:
+    if places:
+        axes.plot(*zip(*places, strict=True), "x", color="#3a3a3a", ms=4, label=NOT_GREEN)
 
 
 def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str) -> Any:
@@ -103,7 +110,9 @@ def _heat_map(axes: Axes, sweep: Sweep, rows: list[dict[str, Any]], metric: str)
     for name, margin in found.items():
         axes.contour(*fine, np.ma.masked_invalid(margin), levels=[0.0], colors=border_colour(name), linestyles="--")
         axes.plot([], [], color=border_colour(name), ls="--", label=f"border: {name}")
-    if found:
+    marked = not_green(rows) if metric == "instability" else []
+    _mark(axes, [(row[across.name], row[up.name]) for row in marked])
+    if found or marked:
         legend_above(axes)
     axes.set(xlabel=axis_words(across, sweep.base), ylabel=axis_words(up, sweep.base))
     return image

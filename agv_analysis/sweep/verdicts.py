@@ -9,13 +9,21 @@ from typing import Any
 
 from agv_analysis.simulation.batch import cores
 from agv_analysis.stability.evidence import evidence_of_scenario
-from agv_analysis.stability.verdict import WORDS, decide
+from agv_analysis.stability.verdict import GREEN, WORDS, decide
 from agv_analysis.sweep.plan import Sweep, varied
 
 FEWEST_RUNS = 10
 """Runs of a point, at least, that count for its verdict: of fewer, one that does not contract may be chance."""
 
+NOT_GREEN = "verdict: not stable"
+"""What pictures call a point whose verdict is not green."""
+
 Rows = list[dict[str, Any]]
+
+
+def not_green(rows: Rows) -> Rows:
+    """Those whose verdict is known, and none of the words that say stable."""
+    return [row for row in rows if row.get("verdict", GREEN[0]) not in GREEN]
 
 
 def with_verdicts(

@@ -43,12 +43,42 @@ def test_a_map_has_a_page_with_points_to_click(
         # T_s K_x (n + 1) < 2
         product, shown = point["ts"] * point["kx"], point["n_bursts"]
         assert shown == -1 if product >= 2.0 else (shown + 1) * product < 2.0 <= (shown + 2) * product
-        command = chromium.find_element("id", "point-command").text
-        assert (
-            command == f"agv-ncs stability params.yaml --set controller.kx={point['kx']} --set plant.ts={point['ts']}"
-        )
+        settings = f"params.yaml --set controller.kx={point['kx']} --set plant.ts={point['ts']}"
+        commands = [f"agv-ncs stability {settings}", f"agv-ncs simulate {settings} --report lap.html"]
+        assert chromium.find_element("id", "point-command").text.splitlines() == commands
         cells = [cell.text for cell in chromium.find_elements("css selector", "#point-values td")]
         assert ("unstable even without outages" if shown == -1 else f"{shown} slots") in cells
+
+
+@pytest.mark.parametrize("axes", ["kx,curvature", "v,kx"])
+def test_the_command_of_a_point_gives_its_margins(
+    chromium: Chrome, agv_ncs: Callable[..., tuple[int, str]], tmp_path: Path, axes: str
+) -> None:
+    """Speed and curvature of a point are those of a line, or of a circle."""
+    options = ("--csv", tmp_path / "map.csv", "--picture", tmp_path / "map.png", "--report", tmp_path / "map.html")
+    status, said = agv_ncs("stability", "config/outages.yaml", "--map", axes, "--points", "6", *options)
+    assert status == 0, said
+    show(chromium, tmp_path / "map.html")
+    data: Any = json.loads(chromium.execute_script("return document.getElementById('data').textContent"))
+    up, across = axes.split(",")
+    point = data["points"][26]
+    of_plot(
+        chromium,
+        "n_bursts",
+        f"(plot.emit('plotly_click', {{points: [{{x: {point[across]!r}, y: {point[up]!r}}}]}}), 1)",
+    )
+    stability, simulate = (line.split()[1:] for line in chromium.find_element("id", "point-command").text.splitlines())
+    (tmp_path / "params.yaml").write_text(data["parameters"])
+    for words in (stability, simulate):
+        words[1] = str(tmp_path / "params.yaml")
+    simulate[-1] = str(tmp_path / "lap.html")
+    status, said = agv_ncs(*stability, "--json", tmp_path / "margins.json")
+    assert status == 0, said
+    found = json.loads((tmp_path / "margins.json").read_text())
+    assert (found["n_max"]["bursts"], found["n_max"]["lifted"]) == (point["n_bursts"], point["n_lifted"])
+    status, said = agv_ncs(*simulate)
+    assert status == 0, said
+    assert (tmp_path / "lap.html").exists()
 
 
 def test_a_map_says_no_probability_that_floats_round_to_certainty(

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from agv_analysis.cli import main
 from agv_analysis.metrics.confidence import clopper_pearson
+from agv_analysis.report.sweep_page import sweep_figure
 from agv_analysis.scenario import load_scenario
 from agv_analysis.simulation import simulate, simulate_batch
 from agv_analysis.sweep.axis_words import axis_words
@@ -30,7 +31,7 @@ from agv_analysis.sweep.rows_file import write_rows
 from agv_analysis.sweep.store import Store
 from agv_analysis.sweep.summary import quantiles
 from agv_analysis.sweep.sweep_sentence import sweep_reason, sweep_sentence
-from agv_analysis.sweep.verdicts import with_verdicts, words_said
+from agv_analysis.sweep.verdicts import NOT_GREEN, with_verdicts, words_said
 from agv_ros.errors import UserError
 
 PAPER = str(Path(__file__).parents[3] / "config" / "paper.yaml")
@@ -375,9 +376,9 @@ def test_the_table_of_corridors_names_its_units_and_says_never(monkeypatch: pyte
     monkeypatch.setenv("COLUMNS", "120")
     options = ["--set", "plant.duration=5.0", "--vary", "controller.kx=25,390", "--corridor", "0.25", "--laps", "20"]
     said = CliRunner().invoke(main, ["sweep", "config/outages.yaml", *options, "--no-verdicts"]).output
-    assert re.search(r"kx +outage +outages +a lap +hour +time \[s\]", said), said
+    assert re.search(r"kx +outage +outages +a lap +hour +mean time", said), said
     assert re.search(r"^ *390 .* never ", said, re.MULTILINE), said
-    assert re.search(r"^ +25 .*\) +above 99.9 % +\d", said, re.MULTILINE), said
+    assert re.search(r"^ +25 .* above 99.9 % +[\d.]+ s ", said, re.MULTILINE), said
 
 
 def test_a_cluster_that_is_not_there_is_named() -> None:
@@ -438,6 +439,16 @@ def test_one_axis_and_two_make_a_picture(tmp_path: Path, axes: tuple[str, ...], 
     sweep = sweep_of(*axes, seeds=2)
     draw(sweep, rows_of(sweep), metric, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_points_whose_runs_contract_are_marked_where_the_mean_square_grows() -> None:
+    """Independent losses on a line: p < (2 - a) / (2 + a) with a = T_s K_x, 0.882 at 25 and 0.975 at 5."""
+    given = (*BERNOULLI, "plant.duration=8.0", "error_detector.track=line")
+    sweep = sweep_of("controller.kx=5,25", "relay.uplink.p=0.5,0.9", seeds=2, given=given)
+    drawn = sweep_figure(sweep, with_verdicts(sweep, rows_of(sweep)))["data"]
+    (marks,) = (trace for trace in drawn if trace.get("name") == NOT_GREEN)
+    assert (marks["x"], marks["y"]) == ([25.0], [0.9])
+    assert {tuple(line) for trace in drawn if trace["type"] == "heatmap" for line in trace["z"]} == {(0.0, 0.0)}
 
 
 def test_an_axis_of_words_makes_none(tmp_path: Path) -> None:
