@@ -94,10 +94,10 @@ def best_point(found: MarginMap) -> str:
     where = ", ".join(_with_unit(label, float(value)) for label, value in place)
     n = int(n_any[row, column])
     outages = "any outages" if n >= LIMIT else f"any outages of up to {counted(n, 'slot')}"
-    kept = f"best kept at {where}: in {outages}"
+    kept = f"best at {where}: stays inside in {outages}"
     if p_hour is None:
         return kept
-    return f"{kept}, left in an hour with a probability {computed_after_of(p_hour[row, column].item())}"
+    return f"{kept}, leaves in an hour with a probability {computed_after_of(p_hour[row, column].item())}"
 
 
 def _driven(scenario: Scenario, place: Mapping[str, float], widths: Widths) -> int:

@@ -42,7 +42,7 @@ def test_the_best_point_is_named() -> None:
     assert best_point(margin_map(base, ("kx", "ts"), gains, periods)) == ""
     small = with_corridor(margin_map(base, ("kx", "ts"), np.array([0.5]), np.array([0.0005])), base)
     assert 0.0 < small.margins[P_HOUR].item() < 1e-12
-    assert best_point(small).endswith("left in an hour with a probability below 1e-12")
+    assert best_point(small).endswith("leaves in an hour with a probability below 1e-12")
 
 
 def test_without_a_closed_form_each_point_is_driven() -> None:
