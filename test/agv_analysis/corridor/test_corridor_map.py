@@ -38,7 +38,10 @@ def test_the_best_point_is_named() -> None:
     row, column = divmod(int(np.argmin(found.margins[P_HOUR])), 2)
     said = best_point(found)
     assert f"kx = {gains[row]:.4g} 1/s, " in said
-    assert f"ts = {periods[column]:.4g} s: in any outages of up to {found.margins[N_ANY][row, column]} slots" in said
+    assert (
+        f"ts = {periods[column]:.4g} s: stays inside in any outages of up to {found.margins[N_ANY][row, column]} slots"
+        in said
+    )
     assert best_point(margin_map(base, ("kx", "ts"), gains, periods)) == ""
     small = with_corridor(margin_map(base, ("kx", "ts"), np.array([0.5]), np.array([0.0005])), base)
     assert 0.0 < small.margins[P_HOUR].item() < 1e-12
