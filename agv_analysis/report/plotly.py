@@ -166,7 +166,9 @@ def _is_broad(panel: Panel) -> bool:
 
 def _y_axis(panel: Panel, is_tight: bool) -> dict[str, Any]:
     # Of a large linear axis 50k is shorter than 0.5 x 10^5, which would lie over its title.
-    axis: dict[str, Any] = {"title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "SI"}
+    axis: dict[str, Any] = {
+        "title": {"text": panel.y_label}, "zeroline": False, "exponentformat": "SI", "hoverformat": ".3~r",
+    }  # fmt: skip
     if panel.log:
         axis |= {"type": "log", "exponentformat": "power"}
     if panel.equal:

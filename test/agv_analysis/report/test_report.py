@@ -238,6 +238,7 @@ def test_it_prints(chromium: Chrome, page: Path) -> None:
     assert [i for i, ink in enumerate(inked) if ink[:, :30].any() or ink[:, -30:].any() or ink[:30].any()] == []
     titles = ("Track", "Errors, speed, age of information", "Outages of the uplink", "Eigenvalues")
     assert [title for title in titles if not any(title in text for text in texts)] == []
+    assert any("Track" in text and "x [m]" in text for text in texts)  # its lower end, too
     # a plot that is not cut has the title of its axis in the middle of the sheet
     for title in ("time [s]", "length [slots]"):
         (sheet,) = (sheet for sheet, text in zip(document, texts, strict=True) if title in text)
