@@ -20,9 +20,10 @@ from agv_analysis.explore.background_criteria import (
     compared_criteria_rows,
     tube_traces,
 )
-from agv_analysis.explore.guard import check_request, guard, listener, said
+from agv_analysis.explore.guard import check_request, guard, said
 from agv_analysis.explore.idle_controls import CONTROLS, idle_controls, idle_lines
 from agv_analysis.explore.page_layout import SHOWN_FOR_A_LAW, STYLE, layout, reason_text, styles_of
+from agv_analysis.explore.page_server import page_server
 from agv_analysis.explore.positions import difference, from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond
 from agv_analysis.explore.settings import PRESETS, Values, preset_values, scenario_of, values_of
@@ -261,11 +262,7 @@ def serve(base: Scenario, port: int, ready: Callable[[str], None]) -> None:
     criteria, tube = LatestOnlyWorker(compared_criteria_rows, rest=_REST), LatestOnlyWorker(tube_traces)
     path = f"/{secrets.token_urlsafe(16)}/"
     app = build(base, criteria, tube, path)
-    werkzeug: Any = importlib.import_module("werkzeug.serving")
-    lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1"}  # which keeps the browser's connections
-    quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
-    with listener(HOST, port) as bound:  # the server has a copy of it
-        server = werkzeug.make_server(HOST, port, app.server, threaded=True, request_handler=quiet, fd=bound.fileno())
+    server = page_server(app.server, HOST, port)
     guard(app.server, server.port)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)

@@ -7,9 +7,7 @@ it, and if the browser says which page it comes from, that must be ours.
 
 from __future__ import annotations
 
-import errno
 import importlib
-import socket
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,24 +31,6 @@ _HEADERS = {
 
 
 THIS_HOST = ("127.0.0.1", "localhost")
-
-_BACKLOG = 128
-"""Connections that wait to be accepted."""
-
-
-def listener(host: str, port: int) -> socket.socket:
-    """A socket that listens for a page's requests. Raises UserError that says why it cannot, and what to do."""
-    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        bound.bind((host, port))
-        bound.listen(_BACKLOG)
-    except OSError as error:
-        bound.close()
-        is_host = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
-        remedy = "give --host an address of this machine" if is_host else "choose another with --port"
-        raise UserError(f"port {port} of {host} cannot be used: {error.strerror}: {remedy}") from None
-    return bound
 
 
 def guard(server: Any, port: int, names: Sequence[str] = THIS_HOST) -> None:

@@ -11,7 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from agv_analysis.explore.guard import THIS_HOST, guard, listener
+from agv_analysis.explore.guard import THIS_HOST, guard
+from agv_analysis.explore.page_server import page_server
 from agv_analysis.watch.watch_session import Edition, WatchSession
 from agv_ros.errors import UserError
 
@@ -111,13 +112,8 @@ def served(session: WatchSession, host: str, port: int) -> Iterator[str]:
     """
     path = f"/{secrets.token_urlsafe(16)}/"
     app = app_of(session, path)
-    werkzeug: Any = importlib.import_module("werkzeug.serving")
-    # With a buffer, which is flushed after each frame, a frame is sent in one call instead of four.
-    lasting = {"log": lambda *_: None, "protocol_version": "HTTP/1.1", "wbufsize": 1 << 16}
-    quiet = type("Quiet", (werkzeug.WSGIRequestHandler,), lasting)
-    with listener(host, port) as bound:  # the server has a copy of it
-        server = werkzeug.make_server(host, port, app, threaded=True, request_handler=quiet, fd=bound.fileno())
-    server.daemon_threads = True
+    # The buffer is flushed after each frame, so that one call sends a frame, not four.
+    server = page_server(app, host, port, buffer=1 << 16)
     guard(app, server.port, (host, *(THIS_HOST if host in THIS_HOST else ())))
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()

@@ -31,7 +31,7 @@ from agv_analysis.explore.background_criteria import (
     criteria_rows,
     tube_traces,
 )
-from agv_analysis.explore.guard import listener
+from agv_analysis.explore.page_server import listener
 from agv_analysis.explore.positions import from_hash, position_of, to_hash, value_of
 from agv_analysis.explore.response import respond, summary_rows, with_channel_of
 from agv_analysis.explore.settings import PRESETS, preset_values, scenario_of, settings_of, values_of
