@@ -277,8 +277,9 @@ class _Process:
             if text.startswith(CLOSED):
                 self._has_closed = True
             elif text.startswith(COUNTS):
-                counts = json.loads(text.removeprefix(COUNTS))
-                self.received, self.published = counts["received"], counts["published"]
+                with contextlib.suppress(ValueError):  # another line has come into it; the next one is whole
+                    counts = json.loads(text.removeprefix(COUNTS))
+                    self.received, self.published = counts["received"], counts["published"]
             elif steps is None or not text.startswith("step "):  # else it says no more than that
                 self._lines.append(text)
 

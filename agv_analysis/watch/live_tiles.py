@@ -31,7 +31,8 @@ class LiveTile(NamedTuple):
 
 def live_tiles(loop: LiveLoop, margin: LinkMargin | None, deadlines: dict[str, str]) -> list[LiveTile]:
     """The figures of a loop now."""
-    largest = loop.recent_deviation()
+    # The newest step is in no point yet. What is not known (NaN) stays so.
+    largest = max(loop.recent_deviation(), loop.latest_deviation()[1])
     return [
         _verdict(margin, deadlines), _deviation(loop, largest), _corridor(loop, largest), _losses(loop),
         _outage(loop, margin), _age(loop), _speed(loop), _deadlines(loop, deadlines),

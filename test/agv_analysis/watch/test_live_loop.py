@@ -156,6 +156,17 @@ def test_the_tiles_say_what_the_analysis_says(seen: LiveLoop) -> None:
     assert tiles["deadlines"].value == "3"
 
 
+def test_the_largest_deviation_is_no_smaller_than_that_of_now() -> None:
+    """At the peak of the run's largest excursion, whose step is in no point yet."""
+    distance = np.hypot(*(run().pose - run().reference[:, :3])[:, :2].T)
+    loop, now = LiveLoop(scenario()), scenario().grid.stamp(int(distance.argmax()))
+    loop.take(heard for heard in messages(run()) if heard.received_ns <= now)
+    loop.make_points()
+    tile = next(tile for tile in live_tiles(loop, None, {}) if tile.key == "deviation")
+    assert tile.value == metres(float(distance.max()))
+    assert tile.note.startswith(f"at most {tile.value} in the last ")
+
+
 @pytest.mark.parametrize(
     ("value", "said"),
     [(0.15374, "0.154 m"), (9.9994, "9.999 m"), (12.3456, "12.35 m"), (6354.381, "6354 m"), (math.nan, "not known"),
