@@ -57,6 +57,7 @@ def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: st
         word="unknown",
         tiles=list(_tiles(found, scenario)),
         at=f"{rows} by {counted(columns, 'point')} about the scenario's own",
+        has_borders=any(margins.min() < 0.0 <= margins.max() for margins in found.margins.values()),
         sections=[{"key": name, "title": _capital(titles[name]), "height": 460} for name in found.margins],
         chosen=_nearest(found, scenario),
         columns=columns,
@@ -96,7 +97,7 @@ def _tiles(found: MarginMap, scenario: Scenario) -> Iterator[Tile]:
         "stable",
         "Stable without outages",
         f"{int(without_outages.sum())} of {points}",
-        "the others are beyond the dashed line",
+        "on the whole map" if without_outages.all() else "the others are beyond the dashed line",
     )
     if N_ANY in found.margins:
         yield Tile("deviation", "Within the corridor", _texts(found, N_ANY)[i][j], titles[N_ANY])
