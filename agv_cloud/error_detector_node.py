@@ -111,7 +111,7 @@ class ErrorDetectorNode(LoopNode[ErrorDetectorParameters]):
         self._slots.limit_window(window_of(mode, self.settings.window_steps))
 
     def on_stop(self, reason: str) -> None:
-        """What is under way is still answered; a clock of its own would go on for ever."""
+        """What is under way is still answered; a clock of its own would go on forever."""
         super().on_stop(reason)
         if self._timer is not None:
             self._timer.cancel()
