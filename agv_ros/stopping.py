@@ -21,9 +21,12 @@ COUNTS = "counts of messages: "
 ENDS_WITH_STDIN = "AGV_NCS_ENDS_WITH_STDIN"
 """Environment variable: a process in which it is set ends when its standard input does.
 
-So who starts processes holds one end of a pipe each, which the system closes however that process ends. What is
-written to it lets a node that was asked to end publish its last message.
+So who starts processes holds one end of a pipe each, which the system closes however that process ends. By END, written
+to it, a process is asked to end, as by a signal, but for one thing: a signal may be lost while a process starts. By
+MAY_CLOSE a node that was asked may publish its last message.
 """
+
+END, MAY_CLOSE = b"e", b"c"
 
 _ORPHAN_PATIENCE = 1.5
 """How long [s] a process whose starter is gone may take to end in order, and then once more to end in a hurry."""
@@ -80,8 +83,10 @@ def ends_with_starter() -> bool:
 
 def _end_with_stdin(stop: Stop) -> None:
     """Body of a thread: once standard input ends, end this process, by force if need be."""
-    while os.read(0, 4096):
-        stop.may_close = True
+    while words := os.read(0, 4096):
+        stop.may_close = stop.may_close or MAY_CLOSE in words
+        if END in words and not stop.requested:
+            stop.ask("the one who started it")
     for _ in range(2):
         stop.ask("the end of the process that started it")
         time.sleep(_ORPHAN_PATIENCE)

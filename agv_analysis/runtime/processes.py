@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import re
 import signal
@@ -29,7 +30,7 @@ from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.progress_line import progress_line, progress_of
 from agv_ros.errors import UserError
 from agv_ros.parameters import as_dict
-from agv_ros.stopping import CLOSED, COUNTS, ENDS_WITH_STDIN, STOPPED_BY, Stop, stop_on_signals
+from agv_ros.stopping import CLOSED, COUNTS, END, ENDS_WITH_STDIN, MAY_CLOSE, STOPPED_BY, Stop, stop_on_signals
 
 _STOP_TIMEOUT = 20.0
 """How long [s] a process that was asked to stop may take; more than the runner's patience with its recorder."""
@@ -133,9 +134,9 @@ def _end(nodes: Mapping[str, _Process], stop: Stop, patience: float, silence: fl
         one.let_close()
     deadline = time.monotonic() + patience
     while any(node.is_open(_LOOK_PERIOD / 10) for node in loop) and time.monotonic() < deadline:
-        if stop.insisted:
+        if stop.insisted or any(node.killed_by for node in loop):
             break
-    _end_all([*loop, *others], stop, patience)
+    _end_all([*loop, *others], stop, patience, after_kill=_SHORT_TIMEOUT)
 
 
 def _await_answers(loop: Sequence[_Process], stop: Stop, silence: float) -> None:
@@ -156,8 +157,13 @@ def _await_answers(loop: Sequence[_Process], stop: Stop, silence: float) -> None
         time.sleep(_LOOK_PERIOD / 10)
 
 
-def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None:
-    """Ask processes to end; after `patience` [s], or as soon as it is insisted on, to hurry; then kill them."""
+def _end_all(
+    processes: Sequence[_Process], stop: Stop, patience: float, after_kill: float = math.inf
+) -> None:  # fmt: skip
+    """Ask processes to end; after `patience` [s], or as soon as it is insisted on, to hurry; then kill them.
+
+    Once one of them has been killed, the others have `after_kill` [s] at most.
+    """
     for timeout, ask in ((patience, _Process.ask_to_end), (_HURRY_TIMEOUT, _Process.hurry)):
         for process in processes:
             ask(process)
@@ -165,6 +171,8 @@ def _end_all(processes: Sequence[_Process], stop: Stop, patience: float) -> None
         while any(process.is_running(_LOOK_PERIOD / 10) for process in processes) and time.monotonic() < deadline:
             if stop.insisted and timeout == patience:
                 break
+            if any(process.killed_by for process in processes):
+                deadline = min(deadline, time.monotonic() + after_kill)
     for process in processes:
         process.collect()
 
@@ -326,26 +334,33 @@ class _Process:
         return self._lines[-1] if self._lines else f"exit status {self.status}, without any output"
 
     def ask_to_end(self) -> None:
-        """Ask it to end in order, unless it has been asked: a second time it would wait for nothing."""
+        """Ask it to end in order, unless it has been asked. One that is halted goes on for it."""
         if not (self._was_asked or self.stopped):
             self._was_asked = True
-            self.hurry()
+            self._write(END)
+            self._signal(signal.SIGCONT)
 
     def let_close(self) -> None:
         """Let it publish its last message, once it is asked to end and has nothing more to answer."""
+        self._write(MAY_CLOSE)
+
+    def _write(self, word: bytes) -> None:
         assert self._process.stdin is not None
         with contextlib.suppress(OSError, ValueError):  # it is gone
-            os.write(self._process.stdin.fileno(), b"\n")
+            os.write(self._process.stdin.fileno(), word)
+
+    def _signal(self, number: signal.Signals) -> None:
+        if self.is_running():
+            self._process.send_signal(number)
 
     def has_received(self, published: Mapping[str, int]) -> bool:
         """Does it say that all has come of what was published?"""
         return all(count >= published.get(topic, 0) for topic, count in (self.received or {}).items())
 
     def hurry(self) -> None:
-        """Ask it to end, or, if it was asked before, to wait for nothing. One that is halted goes on for it."""
-        if self.is_running():
-            self._process.send_signal(signal.SIGINT)
-            self._process.send_signal(signal.SIGCONT)
+        """Ask one that was asked to end to wait for nothing."""
+        self._signal(signal.SIGINT)
+        self._signal(signal.SIGCONT)
 
     def collect(self) -> None:
         """Kill it if it still runs, and read the rest of its output."""
