@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -30,11 +31,15 @@ if TYPE_CHECKING:
 REPOSITORY = Path(__file__).parents[1]
 DOMAINS = range(1, 102)  # those that Linux' ephemeral ports leave free
 FIRST_PORT = 41000
+_claims = itertools.count()
 
 
 def _claim_domain() -> tuple[int, socket.socket]:
-    """A DDS domain that no other test process has, held for as long as the socket is open."""
-    begin = os.getpid()
+    """A DDS domain that no other test process has, held for as long as the socket is open.
+
+    It is another one each time: in one that was used a moment ago, participants may be known that are gone.
+    """
+    begin = os.getpid() + 10 * next(_claims)
     for offset in DOMAINS:
         domain = DOMAINS[(begin + offset) % len(DOMAINS)]
         claim = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
