@@ -191,5 +191,4 @@ def _answer_what_is_under_way(executor: Executor, node: LoopNode[Any], stop: Sto
 
 
 def _counts(node: LoopNode[Any]) -> str:
-    published = {output.topic: output.count for output in node.outputs}
-    return COUNTS + json.dumps({"received": node.received, "published": published})
+    return COUNTS + json.dumps({"received": node.received, "published": node.published()})

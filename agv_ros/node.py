@@ -26,7 +26,7 @@ from agv_ros.messages import CHANGED, PUBLISHED
 from agv_ros.parameter_declaration import declare
 from agv_ros.parameters import LoopParameters, ParameterError, as_dict, build, parameters_of
 from agv_ros.qos import Input, create_publisher
-from agv_ros.settling import Settling
+from agv_ros.settling import Settling, has_all
 from agv_ros.stamps import LATEST_NS, Grid
 from agv_ros.stopping import STOPPED_BY
 
@@ -228,9 +228,13 @@ class LoopNode(Node, Generic[P]):
             timer.cancel()
         self.report(self._last_ns)
 
+    def published(self) -> Counter[str]:
+        """Messages that were sent, by full name of the topic."""
+        return Counter({output.topic: output.count for output in self.outputs})
+
     def has_received(self, published: Counter[str]) -> bool:
         """Has all come here of what was published, by full name of the topic? A node that was closed awaits nothing."""
-        return self._ended or all(count >= published[topic] for topic, count in self.received.items())
+        return self._ended or has_all(self.received, published)
 
     def flush(self, seconds: float, is_hurried: Callable[[], bool] = lambda: False) -> None:
         """Wait until all that was published has arrived, `seconds` at most: a dead subscriber acknowledges nothing."""
@@ -308,7 +312,7 @@ class LoopNode(Node, Generic[P]):
     def report(self, stamp_ns: int) -> None:
         """Publish this node's diagnostics now."""
         total = sum(self.rejected.values())
-        published = {output.topic: output.count for output in self.outputs}
+        published = self.published()
         published[self._diagnostics.topic] += 1  # this report
         facts = self.facts() | {f"{PUBLISHED}{topic}": str(count) for topic, count in published.items()}
         facts |= self._changes

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 
 _QUIET = 0.1
 """Nothing is under way any more when nothing has come for so long [s]."""
+
+
+def has_all(received: Mapping[str, int], published: Mapping[str, int]) -> bool:
+    """Has a node received all that was published on its topics? Both are counts by full name of the topic."""
+    return all(count >= published.get(topic, 0) for topic, count in received.items())
 
 
 class Settling:

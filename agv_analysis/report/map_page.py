@@ -57,7 +57,7 @@ def write_map_page(found: MarginMap, scenario: Scenario, path: Path, command: st
         word="unknown",
         tiles=list(_tiles(found, scenario)),
         at=f"{rows} by {counted(columns, 'point')} about the scenario's own",
-        has_borders=any(margins.min() < 0.0 <= margins.max() for margins in found.margins.values()),
+        has_borders=any(_has_border(name, margins) for name, margins in found.margins.items()),
         sections=[{"key": name, "title": _capital(titles[name]), "height": 460} for name in found.margins],
         chosen=_nearest(found, scenario),
         columns=columns,
@@ -201,11 +201,16 @@ def _scale(values: Floats) -> Mapping[str, Any]:
     return {"type": "log"} if is_wide else {}
 
 
+def _has_border(name: str, margins: Floats) -> bool:
+    """Is the loop stable without outages at some points and not at others, by a margin that says so?"""
+    return name != P_HOUR and bool(margins.min() < 0.0 <= margins.max())
+
+
 def _borders(found: MarginMap, x: list[float], y: list[float]) -> Iterator[dict[str, Any]]:
     """Where the loop ceases to be stable without outages, by each margin that says so here."""
     for (name, title), colour in zip(_shown(found), _COLOURS, strict=False):
         values = np.asarray(found.margins[name], dtype=np.float64)
-        if name != P_HOUR and values.min() < 0.0 <= values.max():
+        if _has_border(name, values):
             yield {
                 "type": "contour", "name": f"border: {title}", "x": x, "y": y, "showscale": False, "hoverinfo": "skip",
                 "z": [plain(row) for row in np.clip(values, -1.0, 0.0)], "showlegend": True,

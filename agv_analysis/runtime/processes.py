@@ -30,6 +30,7 @@ from agv_analysis.scenario import SCHEMAS, Scenario, load_scenario
 from agv_plant.progress_line import progress_line, progress_of
 from agv_ros.errors import UserError
 from agv_ros.parameters import as_dict
+from agv_ros.settling import has_all
 from agv_ros.stopping import CLOSED, COUNTS, END, ENDS_WITH_STDIN, MAY_CLOSE, STOPPED_BY, Stop, stop_on_signals
 
 _STOP_TIMEOUT = 20.0
@@ -147,7 +148,7 @@ def _await_answers(loop: Sequence[_Process], stop: Stop, silence: float) -> None
         for node in loop:
             published.update(node.published)
         is_known = all(node.received is not None for node in open_ones)
-        if is_known and all(node.has_received(published) for node in open_ones):
+        if is_known and all(has_all(node.received or {}, published) for node in open_ones):
             return
         count = sum(sum((node.received or {}).values()) for node in loop)
         if count != newest:
@@ -352,10 +353,6 @@ class _Process:
     def _signal(self, number: signal.Signals) -> None:
         if self.is_running():
             self._process.send_signal(number)
-
-    def has_received(self, published: Mapping[str, int]) -> bool:
-        """Does it say that all has come of what was published?"""
-        return all(count >= published.get(topic, 0) for topic, count in (self.received or {}).items())
 
     def hurry(self) -> None:
         """Ask one that was asked to end to wait for nothing."""

@@ -206,8 +206,7 @@ def _is_quiet(nodes: Sequence[LoopNode[Any]]) -> bool:
     """Has all arrived that these nodes have sent each other?"""
     published: Counter[str] = Counter()
     for node in nodes:
-        for output in node.outputs:
-            published[output.topic] += output.count
+        published.update(node.published())
     return all(node.has_received(published) for node in nodes)
 
 

@@ -32,9 +32,10 @@ class LiveTile(NamedTuple):
 def live_tiles(loop: LiveLoop, margin: LinkMargin | None, deadlines: dict[str, str]) -> list[LiveTile]:
     """The figures of a loop now."""
     # The newest step is in no point yet. What is not known (NaN) stays so.
-    largest = max(loop.recent_deviation(), loop.latest_deviation()[1])
+    _, now = loop.latest_deviation()
+    largest = max(loop.recent_deviation(), now)
     return [
-        _verdict(margin, deadlines), _deviation(loop, largest), _corridor(loop, largest), _losses(loop),
+        _verdict(margin, deadlines), _deviation(loop, now, largest), _corridor(loop, largest), _losses(loop),
         _outage(loop, margin), _age(loop), _speed(loop), _deadlines(loop, deadlines),
     ]  # fmt: skip
 
@@ -57,8 +58,7 @@ def _verdict(margin: LinkMargin | None, deadlines: dict[str, str]) -> LiveTile:
     return LiveTile("word", label, margin.word, sure if margin.word == STABLE else f"stable {sure}", mood)
 
 
-def _deviation(loop: LiveLoop, largest: float) -> LiveTile:
-    _, now = loop.latest_deviation()
+def _deviation(loop: LiveLoop, now: float, largest: float) -> LiveTile:
     settled = f"at most {metres(largest)} in the last {_seconds(loop)}"
     note = settled if not math.isnan(largest) else f"not below {metres(TOLERANCE)} since it began"
     return LiveTile("deviation", "Deviation now", metres(now), note)
